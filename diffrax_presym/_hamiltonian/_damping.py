@@ -1,0 +1,168 @@
+import abc
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Inexact, Real
+
+from .._misc import as_parameter, cast_to
+
+
+Time = Real[Array, ""]
+Scalar = Inexact[Array, ""]
+
+
+class AbstractDamping(eqx.Module):
+    r"""A log scale $\eta(t)$: how much the frame of the momentum has shrunk by $t$.
+
+    The physical equations of motion lose momentum at the rate $\eta'(t)$. Positive
+    rates damp, negative rates excite.
+    """
+
+    @abc.abstractmethod
+    def __call__(self, t: Time) -> Scalar:
+        r"""The log scale $\eta(t)$."""
+
+    @abc.abstractmethod
+    def increment(self, t: Time, h: Time) -> Scalar:
+        r"""The difference $\eta(t + h) - \eta(t)$.
+
+        It is all a solver ever uses of $\eta$. Subtracting two values of $\eta$ loses
+        most digits at late times in `float32`, so each law gives its difference in a
+        form without cancellation.
+        """
+
+    @abc.abstractmethod
+    def rate(self, t: Time) -> Scalar:
+        r"""The rate of damping $\eta'(t)$."""
+
+
+class ConstantDamping(AbstractDamping):
+    r"""The log scale $\eta(t) = \gamma t$: friction at the constant rate $\gamma$.
+
+    The heavy-ball method and the damped oscillator, equation (eta1_large) of França,
+    Jordan and Vidal (2021).
+    """
+
+    gamma: Scalar
+
+    def __init__(self, gamma):
+        """**Arguments:**
+
+        - `gamma`: the rate of damping, in units of one over time. A real number of any
+            sign; negative excites.
+        """
+        self.gamma = as_parameter(gamma, "`ConstantDamping(gamma)`")
+
+    def __call__(self, t: Time) -> Scalar:
+        return cast_to(self.gamma, t) * t
+
+    def increment(self, t: Time, h: Time) -> Scalar:
+        return cast_to(self.gamma, h) * h
+
+    def rate(self, t: Time) -> Scalar:
+        return cast_to(self.gamma, t)
+
+
+class LogDamping(AbstractDamping):
+    r"""The log scale $\eta(t) = \gamma \log(t + s)$: friction that decays as
+    $\gamma / (t + s)$.
+
+    With $\gamma = 3$ and no shift this is the ODE of Nesterov's method, equation
+    (eta1_small) of França, Jordan and Vidal (2021); with $s = 1$ their decaying
+    oscillator.
+
+    The rate is infinite at $t = -s$. Schemes whose stages leave the step, such as
+    [`diffrax_presym.PresymplecticYoshida4`][], need a start further from there than the
+    stages reach.
+    """
+
+    gamma: Scalar
+    shift: Scalar
+
+    def __init__(self, gamma, shift=0.0):
+        """**Arguments:**
+
+        - `gamma`: the strength of the damping, a dimensionless number of any sign.
+        - `shift`: the shift $s$ of time, in units of time. Defaults to 0.
+        """
+        self.gamma = as_parameter(gamma, "`LogDamping(gamma)`")
+        self.shift = as_parameter(shift, "`LogDamping(shift=...)`")
+
+    def __call__(self, t: Time) -> Scalar:
+        return cast_to(self.gamma, t) * jnp.log(t + cast_to(self.shift, t))
+
+    def increment(self, t: Time, h: Time) -> Scalar:
+        since = t + cast_to(self.shift, t)
+        return cast_to(self.gamma, t) * jnp.log1p(h / since)
+
+    def rate(self, t: Time) -> Scalar:
+        return cast_to(self.gamma, t) / (t + cast_to(self.shift, t))
+
+
+class MixedDamping(AbstractDamping):
+    r"""The log scale $\eta(t) = \gamma_1 \log t + \gamma_2 t^\delta$.
+
+    Between [`diffrax_presym.LogDamping`][] and [`diffrax_presym.ConstantDamping`][]:
+    equation (damp_between) of França, Jordan and Vidal (2021). Time must be positive;
+    the remarks on $t = 0$ in [`diffrax_presym.LogDamping`][] hold here too.
+    """
+
+    gamma1: Scalar
+    gamma2: Scalar
+    delta: Scalar
+
+    def __init__(self, gamma1, gamma2, delta):
+        r"""**Arguments:**
+
+        - `gamma1`: the strength of the logarithmic part, dimensionless.
+        - `gamma2`: the strength of the power, in units of time to the power $-\delta$.
+        - `delta`: the exponent, between 0 and 1 in the paper.
+        """
+        self.gamma1 = as_parameter(gamma1, "`MixedDamping(gamma1, ...)`")
+        self.gamma2 = as_parameter(gamma2, "`MixedDamping(..., gamma2, ...)`")
+        self.delta = as_parameter(delta, "`MixedDamping(..., delta)`")
+
+    def _parameters(self, t):
+        return (cast_to(x, t) for x in (self.gamma1, self.gamma2, self.delta))
+
+    def __call__(self, t: Time) -> Scalar:
+        gamma1, gamma2, delta = self._parameters(t)
+        return gamma1 * jnp.log(t) + gamma2 * t**delta
+
+    def increment(self, t: Time, h: Time) -> Scalar:
+        gamma1, gamma2, delta = self._parameters(t)
+        growth = jnp.log1p(h / t)
+        return gamma1 * growth + gamma2 * t**delta * jnp.expm1(delta * growth)
+
+    def rate(self, t: Time) -> Scalar:
+        gamma1, gamma2, delta = self._parameters(t)
+        return gamma1 / t + gamma2 * delta * t ** (delta - 1)
+
+
+class CallableDamping(AbstractDamping):
+    """Any function `eta(t)` as a damping; its increments are plain differences."""
+
+    eta: Callable
+
+    def __call__(self, t: Time) -> Scalar:
+        return cast_to(self.eta(t), t)
+
+    def increment(self, t: Time, h: Time) -> Scalar:
+        return self(t + h) - self(t)
+
+    def rate(self, t: Time) -> Scalar:
+        t = jnp.asarray(t)
+        return jax.jvp(self, (t,), (jnp.ones_like(t),))[1]
+
+
+def as_damping(damping, name: str) -> AbstractDamping:
+    if isinstance(damping, AbstractDamping):
+        return damping
+    if callable(damping):
+        return CallableDamping(damping)
+    raise ValueError(
+        f"{name} must be a damping law or a function eta(t), but got {damping!r}. For "
+        "friction at a constant rate write `ConstantDamping(rate)`."
+    )

@@ -1,0 +1,173 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import PyTree
+
+from .._misc import AbstractVar, scalar_fn, tree_scale
+from ._base import AbstractHamiltonian, P, Q
+from ._damping import AbstractDamping, as_damping, Scalar, Time
+from ._energy import Hamiltonian, SeparableHamiltonian
+from ._kinetic import AbstractKinetic, as_kinetic, CallableKinetic
+
+
+class _AbstractDamped(AbstractHamiltonian):
+    """An undamped Hamiltonian seen from a moving frame."""
+
+    undamped: AbstractVar[AbstractHamiltonian]
+
+    @property
+    def is_separable(self) -> bool:
+        return self.undamped.is_separable
+
+    def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
+        return self.undamped.energy(t, q, p, args)
+
+    def velocity(self, t: Time, q: Q, p: P, args: PyTree = None) -> Q:
+        return self.undamped.velocity(t, q, p, args)
+
+    def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
+        return self.undamped.force(t, q, p, args)
+
+
+class ConformalHamiltonian(_AbstractDamped):
+    r"""Any energy $E$ with friction: $q' = \partial E/\partial p$ and
+    $p' = -\partial E/\partial q - \eta'(t) \, p$.
+
+    The (generalised) conformal Hamiltonian systems, equations (gen_conf) and
+    (new_ham_time) of França, Jordan and Vidal (2021), with
+    $H(t, q, P) = e^{\eta(t)} E(t, q, e^{-\eta(t)} P)$. The energy may depend on time.
+    """
+
+    undamped: AbstractHamiltonian
+    damping: AbstractDamping | None
+
+    def __init__(
+        self,
+        kinetic=None,
+        potential=None,
+        damping=None,
+        *,
+        energy=None,
+        velocity=None,
+        force=None,
+    ):
+        """Write either `ConformalHamiltonian(kinetic, potential, damping)` or
+        `ConformalHamiltonian(energy=energy, damping=damping)`.
+
+        **Arguments:**
+
+        - `kinetic`, `potential`: a separable energy, as for
+            [`diffrax_presym.SeparableHamiltonian`][].
+        - `damping`: a damping law such as [`diffrax_presym.ConstantDamping`][], or a
+            function `eta(t)`, the integral of the rate of damping. Defaults to no
+            damping.
+        - `energy`: an energy that is not separable, as for
+            [`diffrax_presym.Hamiltonian`][].
+        - `velocity`, `force`: either by hand, as for
+            [`diffrax_presym.SeparableHamiltonian`][] or
+            [`diffrax_presym.Hamiltonian`][].
+
+        **Raises:**
+
+        `ValueError` if both or neither of the two forms is given, and as the classes
+        named above.
+        """
+        by_hand = dict(velocity=velocity, force=force)
+        if energy is None and kinetic is not None and potential is not None:
+            self.undamped = SeparableHamiltonian(kinetic, potential, **by_hand)
+        elif energy is not None and kinetic is None and potential is None:
+            self.undamped = Hamiltonian(energy, **by_hand)
+        else:
+            raise ValueError(
+                "`ConformalHamiltonian` needs either `kinetic` and `potential`, or "
+                "`energy`. Write `ConformalHamiltonian(kinetic, potential, damping)` "
+                "or `ConformalHamiltonian(energy=energy, damping=damping)`."
+            )
+        self.damping = None if damping is None else as_damping(damping, "`damping`")
+
+
+class DissipativeHamiltonian(_AbstractDamped):
+    r"""The general family
+    $H = e^{-\eta_1(t)} T(t, q, P) + e^{\eta_2(t)} f(t, q)$.
+
+    Equation (gen_ham) of França, Jordan and Vidal (2021), where $P$ is the canonical
+    momentum. The log scale is $\eta_2$, so the state holds
+    $p = e^{-\eta_2(t)} P$ and the energy is
+    $E = e^{-\eta_1 - \eta_2} T(t, q, e^{\eta_2} p) + f(t, q)$. For
+    [`diffrax_presym.QuadraticKinetic`][] that is $e^{\eta_2 - \eta_1} T(p) + f$, and
+    with $\eta_1 = \eta_2$ the same system as
+    [`diffrax_presym.ConformalHamiltonian`][].
+
+    No exponential of $\eta_2$ itself is formed for the kinetic energies of this
+    package. It is for a kinetic energy given as a plain function, which therefore
+    overflows in `float32` once $2 \eta_2$ exceeds 88.
+    """
+
+    undamped: AbstractHamiltonian
+    damping: AbstractDamping | None
+
+    def __init__(self, kinetic, potential, eta1, eta2, *, separable=True):
+        r"""**Arguments:**
+
+        - `kinetic`: the kinetic energy $T$ as a function of the *canonical* momentum:
+            for example [`diffrax_presym.QuadraticKinetic`][], or a function
+            `T(t, P, args)`; with `separable=False`, a function `T(t, q, P, args)`.
+        - `potential`: the function $f$ to minimise, or potential energy, a function
+            `f(t, q, args)` that returns one number.
+        - `eta1`, `eta2`: damping laws or functions of time.
+        - `separable`: whether `kinetic` does not depend on `q`. Defaults to `True`.
+
+        **Raises:**
+
+        `ValueError` if any of these is of the wrong kind, and when the solve is traced
+        if a function returns values of the wrong shape.
+        """
+        eta1 = as_damping(eta1, "`eta1`")
+        eta2 = as_damping(eta2, "`eta2`")
+        if separable:
+            kinetic = _ScaledKinetic(as_kinetic(kinetic), eta1, eta2)
+            self.undamped = SeparableHamiltonian(kinetic, potential)
+        elif isinstance(kinetic, AbstractKinetic) or not callable(kinetic):
+            raise ValueError(
+                "`DissipativeHamiltonian(..., separable=False)` needs `kinetic` to be "
+                f"a function `T(t, q, P, args)`, but got {kinetic!r}."
+            )
+        else:
+            self.undamped = Hamiltonian(_ScaledEnergy(kinetic, potential, eta1, eta2))
+        self.damping = eta2
+
+
+class _ScaledKinetic(AbstractKinetic):
+    # exp(-eta1 - eta2) T(exp(eta2) p), as exp(eta2 - eta1) times the rescaled T.
+    kinetic: AbstractKinetic
+    eta1: AbstractDamping
+    eta2: AbstractDamping
+
+    def _parts(self, t):
+        eta2 = self.eta2(t)
+        return jnp.exp(eta2 - self.eta1(t)), self.kinetic.rescale(eta2)
+
+    def __call__(self, t, p, args=None):
+        scale, kinetic = self._parts(t)
+        return tree_scale(scale, scalar_fn(kinetic, "The kinetic energy")(t, p, args))
+
+    def velocity(self, t, p, args=None):
+        scale, kinetic = self._parts(t)
+        return tree_scale(scale, kinetic.velocity(t, p, args))
+
+    def rescale(self, s):
+        return _ScaledKinetic(self.kinetic.rescale(s), self.eta1, self.eta2)
+
+
+class _ScaledEnergy(eqx.Module):
+    kinetic: PyTree
+    potential: PyTree
+    eta1: AbstractDamping
+    eta2: AbstractDamping
+
+    def __call__(self, t, q, p, args):
+        at_q = CallableKinetic(lambda t, P, args: self.kinetic(t, q, P, args))
+        kinetic = _ScaledKinetic(at_q, self.eta1, self.eta2)(t, p, args)
+        potential = scalar_fn(self.potential, "The potential")(t, q, args)
+        with jax.numpy_dtype_promotion("standard"):
+            return kinetic + potential

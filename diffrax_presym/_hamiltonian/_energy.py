@@ -1,0 +1,131 @@
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import PyTree
+
+from .._misc import match, scalar_fn
+from ._base import AbstractHamiltonian, P, Q
+from ._damping import Scalar, Time
+from ._kinetic import AbstractKinetic, as_kinetic
+
+
+def _check_callable(fn, name: str, signature: str, optional: bool = False):
+    if not callable(fn) and not (optional and fn is None):
+        raise ValueError(f"`{name}` must be a function `{signature}`, but got {fn!r}.")
+
+
+class SeparableHamiltonian(AbstractHamiltonian):
+    r"""The energy $E = T(t, p) + V(t, q)$, without damping.
+
+    Every scheme of this package is explicit for it. Both parts may depend on time.
+    """
+
+    kinetic: AbstractKinetic
+    potential: Callable
+    velocity_fn: Callable | None
+    force_fn: Callable | None
+    damping = None
+
+    def __init__(self, kinetic, potential, *, velocity=None, force=None):
+        r"""**Arguments:**
+
+        - `kinetic`: the kinetic energy, for example
+            [`diffrax_presym.QuadraticKinetic`][], or a function `T(t, p, args)` that
+            returns one number.
+        - `potential`: the potential energy, a function `V(t, q, args)` that returns one
+            number.
+        - `velocity`: the velocity $\partial T / \partial p$ by hand, a function
+            `velocity(t, p, args)`. Defaults to that of `kinetic`, by automatic
+            differentiation if need be.
+        - `force`: the force $-\partial V / \partial q$ by hand, a function
+            `force(t, q, args)`. Defaults to automatic differentiation.
+
+        **Raises:**
+
+        `ValueError` if any of these is of the wrong kind, and when the solve is traced
+        if a function returns values of the wrong shape.
+        """
+        _check_callable(potential, "potential", "V(t, q, args)")
+        _check_callable(velocity, "velocity", "velocity(t, p, args)", optional=True)
+        _check_callable(force, "force", "force(t, q, args)", optional=True)
+        self.kinetic = as_kinetic(kinetic)
+        self.potential = potential
+        self.velocity_fn = velocity
+        self.force_fn = force
+
+    @property
+    def is_separable(self) -> bool:
+        return True
+
+    def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
+        kinetic = scalar_fn(self.kinetic, "The kinetic energy")(t, p, args)
+        potential = scalar_fn(self.potential, "The potential")(t, q, args)
+        with jax.numpy_dtype_promotion("standard"):
+            return kinetic + potential
+
+    def velocity(self, t: Time, q: Q, p: P, args: PyTree = None) -> Q:
+        if self.velocity_fn is None:
+            return self.kinetic.velocity(t, p, args)
+        return match(self.velocity_fn(t, p, args), p, "`velocity`", "`p`")
+
+    def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
+        if self.force_fn is None:
+            slope = jax.grad(scalar_fn(self.potential, "The potential"), argnums=1)
+            return jtu.tree_map(jnp.negative, slope(t, q, args))
+        return match(self.force_fn(t, q, args), q, "`force`", "`q`")
+
+
+class Hamiltonian(AbstractHamiltonian):
+    r"""Any energy $E(t, q, p)$, without damping; not taken to be separable.
+
+    Euler and leapfrog are implicit for it and need a root finder;
+    [`diffrax_presym.PresymplecticTao`][] is explicit.
+    If the energy is a sum $T(t, p) + V(t, q)$, write
+    [`diffrax_presym.SeparableHamiltonian`][] instead.
+    """
+
+    energy_fn: Callable
+    velocity_fn: Callable | None
+    force_fn: Callable | None
+    damping = None
+
+    def __init__(self, energy, *, velocity=None, force=None):
+        r"""**Arguments:**
+
+        - `energy`: the energy, a function `E(t, q, p, args)` that returns one number.
+        - `velocity`: the velocity $\partial E / \partial p$ by hand, a function
+            `velocity(t, q, p, args)`. Defaults to automatic differentiation.
+        - `force`: the force $-\partial E / \partial q$ by hand, a function
+            `force(t, q, p, args)`. Defaults to automatic differentiation.
+
+        **Raises:**
+
+        `ValueError` if any of these is not a function, and when the solve is traced if
+        a function returns values of the wrong shape.
+        """
+        _check_callable(energy, "energy", "E(t, q, p, args)")
+        _check_callable(velocity, "velocity", "velocity(t, q, p, args)", optional=True)
+        _check_callable(force, "force", "force(t, q, p, args)", optional=True)
+        self.energy_fn = energy
+        self.velocity_fn = velocity
+        self.force_fn = force
+
+    @property
+    def is_separable(self) -> bool:
+        return False
+
+    def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
+        return scalar_fn(self.energy_fn, "The energy")(t, q, p, args)
+
+    def velocity(self, t: Time, q: Q, p: P, args: PyTree = None) -> Q:
+        if self.velocity_fn is None:
+            return jax.grad(self.energy, argnums=2)(t, q, p, args)
+        return match(self.velocity_fn(t, q, p, args), p, "`velocity`", "`p`")
+
+    def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
+        if self.force_fn is None:
+            slope = jax.grad(self.energy, argnums=1)(t, q, p, args)
+            return jtu.tree_map(jnp.negative, slope)
+        return match(self.force_fn(t, q, p, args), q, "`force`", "`q`")

@@ -1,0 +1,179 @@
+import abc
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import lineax as lx
+from jaxtyping import Array, Inexact, PyTree
+
+from .._misc import as_parameter, as_positive, cast_to, scalar_fn, tree_dot, tree_scale
+from ._damping import Scalar, Time
+
+
+class AbstractKinetic(eqx.Module):
+    """A kinetic energy `T(t, p, args)` that knows its velocity."""
+
+    @abc.abstractmethod
+    def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
+        """The kinetic energy, one number for the whole system."""
+
+    @abc.abstractmethod
+    def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
+        r"""The velocity $\partial T / \partial p$."""
+
+    @abc.abstractmethod
+    def rescale(self, s: Scalar) -> "AbstractKinetic":
+        r"""The kinetic energy $T_s(p) = e^{-2s} \, T(e^s p)$, without overflow."""
+
+
+class QuadraticKinetic(AbstractKinetic):
+    r"""The kinetic energy $T(p) = \tfrac12 \, p \cdot M^{-1} p$."""
+
+    mass: PyTree[Inexact[Array, "..."]] | lx.AbstractLinearOperator | None
+
+    def __init__(self, mass=None):
+        """**Arguments:**
+
+        - `mass`: the mass, positive, in any of these forms. Defaults to `None`.
+            - `None`: mass one.
+            - A number: the same mass for every degree of freedom.
+            - An array with as many dimensions as `p`, and broadcastable to it: a mass
+                for each degree of freedom. For `n` particles in three dimensions, with
+                `p` of shape `(n, 3)`, pass masses of shape `(n, 1)`.
+            - A square matrix, with `p` a vector: symmetric and positive definite.
+            - A pytree of the structure of `p`, whose leaves are any of the above.
+            - A [`lineax.AbstractLinearOperator`][] acting on `p`'s space.
+
+        **Raises:**
+
+        `ValueError` if a mass is known not to be positive, or if its shape does not fit
+        `p` (when the solve is traced).
+        """
+        if mass is not None and not isinstance(mass, lx.AbstractLinearOperator):
+            # Off-diagonal entries of a matrix may have any sign.
+            check = lambda m: as_positive if jnp.ndim(m) < 2 else as_parameter
+            mass = jtu.tree_map(lambda m: check(m)(m, "`QuadraticKinetic(mass)`"), mass)
+        self.mass = mass
+
+    def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
+        energy = tree_dot(p, self.velocity(t, p, args))
+        return energy / 2
+
+    def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
+        mass = self.mass
+        if mass is None:
+            return p
+        if isinstance(mass, lx.AbstractLinearOperator):
+            return lx.linear_solve(mass, p, throw=False).value
+        if eqx.is_array(mass):
+            return jtu.tree_map(lambda pi: _divide(pi, mass), p)
+        if jtu.tree_structure(mass) != jtu.tree_structure(p):
+            raise ValueError(
+                "`QuadraticKinetic(mass)` must be one mass, or a pytree of masses of "
+                f"the structure of `p`, {jtu.tree_structure(p)}, but got "
+                f"{jtu.tree_structure(mass)}."
+            )
+        return jtu.tree_map(_divide, p, mass)
+
+    def rescale(self, s: Scalar) -> "QuadraticKinetic":
+        return self
+
+
+def _divide(p, mass):
+    mass = cast_to(mass, p)
+    if mass.ndim == 2 and p.ndim == 1:
+        if mass.shape != (p.size, p.size):
+            raise ValueError(
+                "`QuadraticKinetic(mass)` with a matrix needs one row and column for "
+                f"each entry of `p`, but got shape {mass.shape} for `p` of shape "
+                f"{p.shape}."
+            )
+        operator = lx.MatrixLinearOperator(mass, lx.positive_semidefinite_tag)
+        return lx.linear_solve(operator, p, lx.Cholesky(), throw=False).value
+    fits = mass.ndim == 0 or (
+        mass.ndim == p.ndim
+        and all(m in (1, n) for m, n in zip(mass.shape, p.shape, strict=True))
+    )
+    if not fits:
+        raise ValueError(
+            f"`QuadraticKinetic(mass)` of shape {mass.shape} does not fit `p` of shape "
+            f"{p.shape}. Pass a number, or masses with as many dimensions as `p` that "
+            "broadcast to it, for example `mass[:, None]` for `n` particles with `p` "
+            "of shape `(n, 3)`; or a matrix for a vector `p`."
+        )
+    return p / mass
+
+
+class RelativisticKinetic(AbstractKinetic):
+    r"""The kinetic energy $T(p) = c \sqrt{p \cdot p + m^2 c^2}$ of one particle.
+
+    All entries of `p` together are the momentum of one particle, whose speed never
+    exceeds $c$. As a kinetic energy for optimisation, equation (rel_ham) of França,
+    Jordan and Vidal (2021), it bounds the size of a step.
+    """
+
+    mass: Scalar
+    speed: Scalar
+
+    def __init__(self, mass=1.0, speed=1.0):
+        """**Arguments:**
+
+        - `mass`: the rest mass $m$, a positive number. Defaults to 1.
+        - `speed`: the speed of light $c$, a positive number. Defaults to 1.
+
+        **Raises:**
+
+        `ValueError` if either is known not to be positive.
+        """
+        self.mass = as_positive(mass, "`RelativisticKinetic(mass=...)`")
+        self.speed = as_positive(speed, "`RelativisticKinetic(speed=...)`")
+
+    def _norm(self, p):
+        square = tree_dot(p, p)
+        rest = cast_to(self.mass, square) * cast_to(self.speed, square)
+        return jnp.sqrt(square + rest**2)
+
+    def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
+        norm = self._norm(p)
+        return cast_to(self.speed, norm) * norm
+
+    def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
+        norm = self._norm(p)
+        return tree_scale(cast_to(self.speed, norm) / norm, p)
+
+    def rescale(self, s: Scalar) -> "RelativisticKinetic":
+        speed = self.speed * cast_to(jnp.exp(-s), self.speed)
+        return eqx.tree_at(lambda k: k.speed, self, speed)
+
+
+class CallableKinetic(AbstractKinetic):
+    """Any function `T(t, p, args)` as a kinetic energy; its velocity by autodiff, or
+    as given by hand."""
+
+    fn: Callable
+
+    def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
+        return self.fn(t, p, args)
+
+    def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
+        return jax.grad(scalar_fn(self.fn, "The kinetic energy"), argnums=1)(t, p, args)
+
+    def rescale(self, s: Scalar) -> "CallableKinetic":
+        def rescaled(t, p, args):
+            energy = self.fn(t, tree_scale(jnp.exp(s), p), args)
+            return tree_scale(jnp.exp(-2 * s), energy)
+
+        return CallableKinetic(rescaled)
+
+
+def as_kinetic(kinetic) -> AbstractKinetic:
+    if isinstance(kinetic, AbstractKinetic):
+        return kinetic
+    if callable(kinetic):
+        return CallableKinetic(kinetic)
+    raise ValueError(
+        "`kinetic` must be a kinetic energy or a function `T(t, p, args)`, but got "
+        f"{kinetic!r}. For a mass write `QuadraticKinetic(mass)`."
+    )

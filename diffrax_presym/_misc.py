@@ -1,0 +1,102 @@
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Inexact, PyTree
+
+
+if TYPE_CHECKING:
+    # To a type checker an abstract field is any kind of field.
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar as AbstractVar
+
+
+def as_parameter(x, name: str) -> Inexact[Array, "..."]:
+    """A user's number as a leaf that `jax.grad` and `eqx.filter_grad` reach."""
+    if not eqx.is_array_like(x):
+        raise ValueError(f"{name} must be a real number, but got {x!r}.")
+    if jnp.issubdtype(jnp.result_type(x), jnp.complexfloating):
+        raise ValueError(f"{name} must be real, but got {x!r}.")
+    if not jnp.issubdtype(jnp.result_type(x), jnp.floating):
+        x = jnp.asarray(x, jnp.result_type(float))
+    return jnp.asarray(x)
+
+
+def as_positive(x, name: str) -> Inexact[Array, "..."]:
+    """As `as_parameter`, and positive, as far as the value is known yet."""
+    x = as_parameter(x, name)
+    if not isinstance(x, Tracer) and not bool(jnp.all(x > 0)):
+        raise ValueError(f"{name} must be positive, but got {x}.")
+    return x
+
+
+def cast_to(x: ArrayLike, like: ArrayLike) -> Array:
+    """`x` in the precision of `like`: a parameter never upcasts time or state."""
+    return jnp.asarray(x, jnp.result_type(like))
+
+
+def tree_add(y: PyTree, h: ArrayLike, dy: PyTree) -> PyTree:
+    """`y + h * dy`, each leaf in its own precision."""
+    return jtu.tree_map(lambda yi, di: yi + cast_to(h, yi) * di, y, dy)
+
+
+def tree_scale(c: ArrayLike | None, y: PyTree) -> PyTree:
+    """`c * y`, each leaf in its own precision; no operation at all for `None`."""
+    if c is None:
+        return y
+    return jtu.tree_map(lambda yi: cast_to(c, yi) * yi, y)
+
+
+def tree_dot(x: PyTree, y: PyTree) -> Array:
+    """The inner product of two pytrees of one structure."""
+    dots = jtu.tree_map(lambda xi, yi: jnp.sum(xi * yi), x, y)
+    with jax.numpy_dtype_promotion("standard"):
+        return jtu.tree_reduce(jnp.add, dots)
+
+
+def scalar_fn(fn, name: str):
+    """`fn`, with a clear error should it return anything but one real number."""
+
+    def checked(*args):
+        out = fn(*args)
+        leaves = jtu.tree_leaves(out)
+        if (
+            len(leaves) != 1
+            or jnp.shape(leaves[0]) != ()
+            or not jnp.issubdtype(jnp.result_type(leaves[0]), jnp.floating)
+        ):
+            got = jtu.tree_map(
+                lambda x: f"{jnp.result_type(x)}{list(jnp.shape(x))}", out
+            )
+            raise ValueError(
+                f"{name} must return one real number, the energy of the whole system, "
+                f"but returned {got}. Sum over the degrees of freedom, for example "
+                "`jnp.sum(...)`."
+            )
+        return leaves[0]
+
+    return checked
+
+
+def match(value: PyTree, like: PyTree, name: str, like_name: str) -> PyTree:
+    """A user's velocity or force, broadcast and cast to the leaves of the state."""
+    if jtu.tree_structure(value) != jtu.tree_structure(like):
+        raise ValueError(
+            f"{name} must return a pytree of the same structure as {like_name}, "
+            f"{jtu.tree_structure(like)}, but returned {jtu.tree_structure(value)}."
+        )
+
+    def leaf(v, x):
+        try:
+            return jnp.broadcast_to(cast_to(v, x), jnp.shape(x))
+        except ValueError as e:
+            raise ValueError(
+                f"{name} must return arrays of the shapes of {like_name}, but returned "
+                f"shape {jnp.shape(v)} for a leaf of shape {jnp.shape(x)}."
+            ) from e
+
+    return jtu.tree_map(leaf, value, like)

@@ -1,0 +1,180 @@
+"""Kick, drift, and a momentum that moves with its frame: all schemes are made of them.
+
+The state is a pair `(q, p)` with `p` in the frame of the current time. A kick moves `p`
+and nothing else. A drift moves `q` and takes time, and so the frame of `p`, along.
+"""
+
+import abc
+from typing import ClassVar, Generic, Literal, TypeVar
+
+import diffrax as dfx
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import optimistix as optx
+from jaxtyping import PyTree
+
+from .._interpolation import HermiteInterpolation
+from .._misc import AbstractVar, tree_add, tree_scale
+from .._term import check_state, State, View, view
+
+
+_Carry = TypeVar("_Carry")
+Result = dfx.RESULTS | None  # `None`: nothing that could fail was done
+
+
+class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
+    """A one-step scheme for the term [`diffrax_presym.HamiltonianTerm`][].
+
+    A scheme says how it starts and how it advances; saving, events, adjoints and the
+    direction of time are `diffrax.diffeqsolve`'s, as for any of its own solvers. No
+    scheme estimates its error; to adapt the step, wrap it in `diffrax.HalfSolver`.
+    """
+
+    # Broader than `HamiltonianTerm`, so that a term of another kind reaches `view` and
+    # its error message, which says what to write instead.
+    term_structure: ClassVar = dfx.AbstractTerm
+    interpolation_cls: ClassVar = HermiteInterpolation
+
+    @property
+    @abc.abstractmethod
+    def is_symmetric(self) -> bool:
+        """Whether a step backwards undoes a step."""
+
+    @abc.abstractmethod
+    def start(self, view: View, t, y: State) -> _Carry:
+        """What the scheme carries from step to step besides the state, at the start."""
+
+    @abc.abstractmethod
+    def advance(
+        self, view: View, t0, t1, h, y: State, carry: _Carry
+    ) -> tuple[State, _Carry, Result]:
+        """One step from `t0` to `t1`, in physical time.
+
+        `h` is their difference, to more digits than can be had by subtraction.
+        """
+
+    @abc.abstractmethod
+    def slope(self, view: View, t, y: State, carry: _Carry) -> State:
+        """The full vector field at an end of a step, for dense output."""
+
+    def init(self, terms, t0, t1, y0, args) -> _Carry:
+        check_state(y0)
+        system = view(terms, args)
+        return self.start(system, system.time(t0), y0)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        system = view(terms, args)
+        t0, t1 = system.time(t0), system.time(t1)
+        carry = solver_state
+        # A jump makes what was carried stale. It is a Python bool, and nothing is
+        # traced, unless a controller or the user says otherwise.
+        if made_jump is not False and jtu.tree_leaves(carry):
+            restart = lambda: self.start(system, t0, y0)
+            carry = lax.cond(made_jump, restart, lambda: solver_state)
+        h = t1 - t0
+        y1, new_carry, result = self.advance(system, t0, t1, h, y0, carry)
+        dense_info = dict(
+            y0=y0,
+            y1=y1,
+            k0=tree_scale(h, self.slope(system, t0, y0, carry)),
+            k1=tree_scale(h, self.slope(system, t1, y1, new_carry)),
+        )
+        result = dfx.RESULTS.successful if result is None else result
+        return y1, None, dense_info, new_carry, result
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+
+class AbstractKickDriftSolver(AbstractPresymplecticSolver[_Carry]):
+    """A scheme made of the two half-steps of the paper, adjoint to each other.
+
+    Both are explicit for a separable system and implicit for any other.
+    """
+
+    first: AbstractVar[Literal["momentum", "position"]]
+    root_finder: AbstractVar[optx.AbstractRootFinder | None]
+    root_find_max_steps: AbstractVar[int]
+
+    def __check_init__(self):
+        if self.first not in ("momentum", "position"):
+            raise ValueError(
+                f'`first` must be "momentum" or "position", but got {self.first!r}.'
+            )
+        if self.root_finder is not None:
+            _check_root_finder(self.root_finder)
+
+    def momentum_first(self, view: View, t, h, y: State, force=None):
+        """Kick at `t`, then drift to `t + h` with the velocity frozen at `t`.
+
+        Equation (presymp_euler), A in the design of the schemes. `force` is the force
+        at the start, if it is known.
+        """
+        q, p = y
+
+        def kicked(p_new):
+            known = view.force(t, (q, p_new)) if force is None else force
+            return tree_add(p, h, known)
+
+        p, result = self._solve(view, kicked, p)
+        q = tree_add(q, h, view.velocity(t, (q, p)))
+        return (q, view.move_frame(t, h, p)), result
+
+    def position_first(self, view: View, t, h, y: State, t1):
+        """Drift to `t1 = t + h` with the velocity frozen at `t1`, then kick at `t1`.
+
+        Equation (presymp_euler2), B in the design of the schemes: B over `h` undoes A
+        over `-h`. Returns the force at the end too.
+        """
+        q, p = y
+        p = view.move_frame(t, h, p)
+        moved = lambda q_new: tree_add(q, h, view.velocity(t1, (q_new, p)))
+        q, result = self._solve(view, moved, q)
+        force = view.force(t1, (q, p))
+        return (q, tree_add(p, h, force)), force, result
+
+    def _solve(self, view: View, fn, guess: PyTree) -> tuple[PyTree, Result]:
+        # The solution of x = fn(x), where fn ignores x if the system is separable.
+        if view.is_separable:
+            return fn(guess), None
+        if self.root_finder is None:
+            raise ValueError(
+                f"`{type(view.hamiltonian).__name__}` is not separable here, so "
+                f"`{type(self).__name__}` is implicit. Pass a root finder, for example "
+                "`root_finder=optimistix.Newton(rtol=1e-10, atol=1e-10)`; or use "
+                "`PresymplecticTao()`, which is explicit; or, if the energy is a sum "
+                "T(t, p) + V(t, q), write it as a `SeparableHamiltonian`."
+            )
+        residual = lambda x, _: jtu.tree_map(jnp.subtract, fn(x), x)
+        solution = optx.root_find(
+            residual,
+            self.root_finder,
+            guess,
+            max_steps=self.root_find_max_steps,
+            throw=False,
+        )
+        return solution.value, dfx.RESULTS.promote(solution.result)
+
+
+def _check_root_finder(root_finder) -> None:
+    if not isinstance(root_finder, optx.AbstractRootFinder):
+        raise ValueError(
+            "`root_finder` must be an Optimistix root finder, for example "
+            f"`optimistix.Newton(rtol=1e-10, atol=1e-10)`, but got {root_finder!r}."
+        )
+    # Diffrax's own root finders leave their tolerances to an adaptive controller.
+    for name in ("rtol", "atol"):
+        if not eqx.is_array_like(getattr(root_finder, name, 0.0)):
+            raise ValueError(
+                f"`root_finder` needs a tolerance `{name}` of its own. Write for "
+                "example `optimistix.Newton(rtol=1e-10, atol=1e-10)`."
+            )
+
+
+def first_failure(result: Result, other: Result) -> Result:
+    """The first of two results, unless it is a success."""
+    if result is None or other is None:
+        return other if result is None else result
+    return dfx.RESULTS.where(result == dfx.RESULTS.successful, other, result)

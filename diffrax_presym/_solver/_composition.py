@@ -1,0 +1,293 @@
+import math
+from decimal import Decimal, localcontext
+from typing import Literal
+
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import optimistix as optx
+from jaxtyping import PyTree
+
+from .._misc import AbstractVar, cast_to
+from .._term import State, View
+from ._base import AbstractPresymplecticSolver
+from ._leapfrog import PresymplecticLeapfrog
+from ._tao import PresymplecticTao
+
+
+Weights = tuple[float, ...]
+
+
+class AbstractComposition(AbstractPresymplecticSolver[PyTree]):
+    """One step made of several steps of a base scheme, by fractions that sum to one."""
+
+    base: AbstractVar[AbstractPresymplecticSolver]
+    weights: AbstractVar[Weights]
+
+    def __check_init__(self):
+        base, weights = self.base, self.weights
+        if not isinstance(base, AbstractPresymplecticSolver):
+            raise ValueError(
+                "`base` must be a presymplectic solver, for example "
+                f"`PresymplecticLeapfrog()`, but got {base!r}."
+            )
+        if len(set(weights)) == 1:
+            return
+        # Steps of unequal length cancel each other's errors only if those are even in
+        # the length of the step.
+        if not base.is_symmetric:
+            raise ValueError(
+                f"Compositions need a symmetric base, which `{type(base).__name__}` is "
+                "not. Compose `PresymplecticLeapfrog()` instead."
+            )
+        if isinstance(base, PresymplecticTao) and base.coupling is None:
+            raise ValueError(
+                "Inside a composition `PresymplecticTao` needs a coupling that does "
+                "not change with the step, or the order is lost. Write "
+                "`PresymplecticTao(coupling)` with a few times the highest frequency "
+                "of the system."
+            )
+
+    @property
+    def is_symmetric(self) -> bool:
+        return self.base.is_symmetric and self.weights == self.weights[::-1]
+
+    def start(self, view: View, t, y: State):
+        return self.base.start(view, t, y)
+
+    def advance(self, view: View, t0, t1, h, y: State, carry: PyTree):
+        ends = t0 + cast_to(np.cumsum(self.weights), h) * h
+        # Rounding must not make the last stage miss the end of the step.
+        ends = jnp.concatenate([ends[:-1], t1[None]])
+        starts = jnp.concatenate([t0[None], ends[:-1]])
+        lengths = cast_to(np.array(self.weights), h) * h
+
+        def stage(state, times):
+            y, carry, result = self.base.advance(view, *times, *state)
+            return (y, carry), result
+
+        (y, carry), results = lax.scan(stage, (y, carry), (starts, ends, lengths))
+        if results is not None:
+            # The first stage to fail, or any if none did.
+            failed = jnp.argmax(results != type(results).successful)
+            results = jtu.tree_map(lambda x: x[failed], results)
+        return y, carry, results
+
+    def slope(self, view: View, t, y: State, carry: PyTree) -> State:
+        return self.base.slope(view, t, y, carry)
+
+
+class Composition(AbstractComposition):
+    """Any composition of a symmetric scheme with itself, by weights of your own.
+
+    Its cost per step is that of the base times the number of weights. Uses the base's
+    dense/ts output.
+    """
+
+    base: AbstractPresymplecticSolver
+    weights: Weights = eqx.field(static=True)
+    composed_order: int | None = eqx.field(static=True)
+
+    def __init__(self, base, weights, order: int | None = None):
+        """**Arguments:**
+
+        - `base`: a symmetric presymplectic solver, for example
+            [`diffrax_presym.PresymplecticLeapfrog`][].
+        - `weights`: the lengths of the stages in units of the step: real numbers of any
+            sign that sum to one.
+        - `order`: the order of the composition, which the weights imply but do not
+            tell. Used by adaptive step size controllers. Defaults to that of the base.
+
+        **Raises:**
+
+        `ValueError` if the weights do not sum to one, or the base is not symmetric.
+        """
+        weights = tuple(float(w) for w in weights)
+        total = math.fsum(weights)
+        if not abs(total - 1) < 1e-12:
+            raise ValueError(
+                f"`weights` must sum to one, but sum to {total}. To scale them, divide "
+                "by their sum."
+            )
+        _check_order(order, smallest=1)
+        self.base = base
+        self.weights = weights
+        self.composed_order = order
+
+    def order(self, terms):
+        if self.composed_order is None:
+            return self.base.order(terms)
+        return self.composed_order
+
+
+class SuzukiYoshida(AbstractComposition):
+    r"""The triple jump of Suzuki and Yoshida, to any even order.
+
+    Order as given; $3^{r/2 - 1}$ force evaluations per step at order $r$. Symmetric.
+    Uses 3rd order Hermite interpolation for dense/ts output.
+
+    The scheme of the paper. Its error constants are large and its stages leave the
+    step, by up to 0.35, 0.65 and 0.92 of its length at orders 4, 6 and 8, on either
+    side. A Hamiltonian that is singular at the start of time, such as with
+    [`diffrax_presym.LogDamping`][] without a shift, is then evaluated before it exists.
+
+    ??? cite "Reference"
+
+        Equation (yoshida_comp) of França, Jordan and Vidal (2021), after
+
+        ```bibtex
+        @article{yoshida1990construction,
+            author={Yoshida, Haruo},
+            title={Construction of higher order symplectic integrators},
+            journal={Physics Letters A},
+            volume={150},
+            number={5-7},
+            pages={262--268},
+            year={1990},
+        }
+
+        @article{suzuki1990fractal,
+            author={Suzuki, Masuo},
+            title={Fractal decomposition of exponential operators with applications to
+                   many-body theories and {M}onte {C}arlo simulations},
+            journal={Physics Letters A},
+            volume={146},
+            number={6},
+            pages={319--323},
+            year={1990},
+        }
+        ```
+    """
+
+    base: AbstractPresymplecticSolver
+    weights: Weights = eqx.field(static=True)
+    composed_order: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        order: int,
+        base: AbstractPresymplecticSolver = PresymplecticLeapfrog(),  # noqa: B008
+    ):
+        """**Arguments:**
+
+        - `order`: the order, a positive even number. At 2 it is the base itself.
+        - `base`: a symmetric presymplectic solver of second order. Defaults to
+            [`diffrax_presym.PresymplecticLeapfrog`][].
+
+        **Raises:**
+
+        `ValueError` if the order is not a positive even number, or the base is not
+        symmetric.
+        """
+        _check_order(order, smallest=2)
+        if order % 2 != 0:
+            raise ValueError(
+                f"`SuzukiYoshida(order)` needs an even order, but got {order}. Write "
+                f"`SuzukiYoshida({order + 1})`."
+            )
+        self.base = base
+        self.weights = triple_jump(order)
+        self.composed_order = order
+
+    def order(self, terms):
+        return self.composed_order
+
+
+class PresymplecticYoshida4(AbstractComposition):
+    """The fourth-order method of Creutz and Gocksch, Forest and Ruth, Suzuki, Yoshida.
+
+    4th order and symmetric. Three force evaluations per step. Uses 3rd order Hermite
+    interpolation for dense/ts output.
+
+    The fourth-order scheme of the paper, the same as
+    [`diffrax_presym.SuzukiYoshida`][]`(4)`; see there for its limitations.
+
+    ??? cite "Reference"
+
+        Equation (yoshida_comp) with `r = 1` of França, Jordan and Vidal (2021), after
+
+        ```bibtex
+        @article{forest1990fourth,
+            author={Forest, Etienne and Ruth, Ronald D.},
+            title={Fourth-order symplectic integration},
+            journal={Physica D: Nonlinear Phenomena},
+            volume={43},
+            number={1},
+            pages={105--117},
+            year={1990},
+        }
+        ```
+    """
+
+    base: AbstractPresymplecticSolver
+    weights: Weights = eqx.field(static=True)
+
+    def __init__(
+        self,
+        first: Literal["momentum", "position"] = "momentum",
+        root_finder: optx.AbstractRootFinder | None = None,
+        root_find_max_steps: int = 32,
+    ):
+        self.base = PresymplecticLeapfrog(first, root_finder, root_find_max_steps)
+        self.weights = triple_jump(4)
+
+    def order(self, terms):
+        return 4
+
+
+PresymplecticYoshida4.__init__.__doc__ = PresymplecticLeapfrog.__init__.__doc__
+
+
+class Substeps(AbstractComposition):
+    """Several equal steps of a scheme as one step of the solve.
+
+    Order and accuracy at the ends of its steps are those of the base; the cost per step
+    is `n` times its cost. Dense/ts output interpolates across all `n` steps at once,
+    and is coarser accordingly.
+
+    What `diffeqsolve` does once per step (`SaveAt(ts=...)`, events, `SaveAt(steps=...)`
+    of every `n`-th step, progress meters) it then does `n` times less often.
+    """
+
+    base: AbstractPresymplecticSolver
+    weights: Weights = eqx.field(static=True)
+
+    def __init__(self, base: AbstractPresymplecticSolver, n: int):
+        """**Arguments:**
+
+        - `base`: any presymplectic solver.
+        - `n`: how many of its steps make one step, a positive integer. The `dt0` of the
+            solve is `n` times the step of the base.
+
+        **Raises:**
+
+        `ValueError` if `n` is not a positive integer.
+        """
+        if not isinstance(n, int) or n < 1:
+            raise ValueError(f"`Substeps(base, n)` needs a positive n, but got {n!r}.")
+        self.base = base
+        self.weights = (1 / n,) * n
+
+    def order(self, terms):
+        return self.base.order(terms)
+
+
+def triple_jump(order: int) -> Weights:
+    """The weights of equation (yoshida_comp), correct to the last digit of a float."""
+    with localcontext() as context:
+        context.prec = 50
+        weights = [Decimal(1)]
+        for r in range(1, order // 2):
+            kappa = Decimal(2) ** (Decimal(1) / (2 * r + 1))
+            outer, inner = 1 / (2 - kappa), -kappa / (2 - kappa)
+            weights = [j * w for j in (outer, inner, outer) for w in weights]
+        return tuple(float(w) for w in weights)
+
+
+def _check_order(order, smallest: int) -> None:
+    if order is not None and (not isinstance(order, int) or order < smallest):
+        raise ValueError(
+            f"`order` must be an integer of at least {smallest}, but got {order!r}."
+        )

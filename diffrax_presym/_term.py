@@ -1,0 +1,165 @@
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Inexact, PyTree
+
+from ._hamiltonian import AbstractHamiltonian
+from ._misc import cast_to, tree_add, tree_scale
+
+
+State = tuple[PyTree[Inexact[Array, "..."]], PyTree[Inexact[Array, "..."]]]
+
+
+class HamiltonianTerm(dfx.AbstractTerm):
+    r"""The equations of motion of a Hamiltonian, for `diffrax.diffeqsolve`.
+
+    The state is a pair `(q, p)` of pytrees of one structure, the positions and the
+    *mechanical* momenta (see [`diffrax_presym.AbstractHamiltonian`][]).
+
+    The solvers of this package ask the term for velocity, force and frame. Any other
+    Diffrax solver for ordinary differential equations accepts it too, and is given the
+    full vector field $(\partial E/\partial p, -\partial E/\partial q - \eta'(t) \, p)$.
+    Comparing the two is changing one word.
+
+    !!! example
+
+        ```python
+        hamiltonian = ConformalHamiltonian(
+            QuadraticKinetic(),
+            lambda t, q, args: jnp.sum(q**2) / 2,
+            ConstantDamping(0.2),
+        )
+        sol = diffeqsolve(
+            HamiltonianTerm(hamiltonian), PresymplecticLeapfrog(),
+            t0=0.0, t1=10.0, dt0=0.1, y0=(jnp.array([1.0]), jnp.array([0.0])),
+        )
+        ```
+    """
+
+    hamiltonian: AbstractHamiltonian
+
+    def __init__(self, hamiltonian: AbstractHamiltonian):
+        """**Arguments:**
+
+        - `hamiltonian`: any [`diffrax_presym.AbstractHamiltonian`][].
+
+        **Raises:**
+
+        `ValueError` if it is not one; and when the solve is traced, if the state is not
+        a pair of real floating-point pytrees of one structure and shape.
+        """
+        if not isinstance(hamiltonian, AbstractHamiltonian):
+            raise ValueError(
+                f"`HamiltonianTerm` needs a Hamiltonian, but got {hamiltonian!r}. "
+                "Write for example `HamiltonianTerm(SeparableHamiltonian(kinetic, "
+                "potential))`, or `HamiltonianTerm(Hamiltonian(energy))` for a "
+                "function `energy(t, q, p, args)`."
+            )
+        self.hamiltonian = hamiltonian
+
+    def vf(self, t, y: State, args: PyTree) -> State:
+        check_state(y)
+        return View(self.hamiltonian, args, 1).slope(jnp.asarray(t), y)
+
+    def contr(self, t0, t1, **kwargs):
+        return t1 - t0
+
+    def prod(self, vf: State, control) -> State:
+        return tree_scale(control, vf)
+
+
+class View(eqx.Module):
+    """What a solver sees of a term: velocity, force and frame, in physical time."""
+
+    hamiltonian: AbstractHamiltonian
+    args: PyTree
+    direction: int | Array
+
+    @property
+    def is_separable(self) -> bool:
+        return self.hamiltonian.is_separable
+
+    def time(self, t):
+        """The physical time, which runs backwards where `direction` is -1."""
+        return t * cast_to(self.direction, t)
+
+    def velocity(self, t, y: State):
+        return self.hamiltonian.velocity(t, *y, self.args)
+
+    def force(self, t, y: State):
+        return self.hamiltonian.force(t, *y, self.args)
+
+    def decay(self, t, h):
+        """`exp(eta(t) - eta(t + h))`, from frame to frame; `None` without damping."""
+        damping = self.hamiltonian.damping
+        if damping is None:
+            return None
+        increment = damping.increment(t, h)
+        if jnp.shape(increment) != ():
+            raise ValueError(
+                "The damping must be one number for the whole system, but has shape "
+                f"{jnp.shape(increment)}. The momenta share one frame; solve systems "
+                "with different dampings side by side with `jax.vmap`."
+            )
+        return jnp.exp(-increment)
+
+    def move_frame(self, t, h, p: PyTree) -> PyTree:
+        """`p` from the frame of `t` to the frame of `t + h`."""
+        return tree_scale(self.decay(t, h), p)
+
+    def slope(self, t, y: State, force=None) -> State:
+        """The full vector field, of which the force may be known already."""
+        damping = self.hamiltonian.damping
+        force = self.force(t, y) if force is None else force
+        if damping is not None:
+            force = tree_add(force, -damping.rate(t), y[1])
+        return self.velocity(t, y), force
+
+
+def view(terms: PyTree, args: PyTree) -> View:
+    """The view of the term that `diffeqsolve` hands to a solver."""
+    term, direction = terms, 1
+    # Diffrax wraps a term to solve backwards in time. Its wrapper is private, so it is
+    # known here by its two attributes.
+    if hasattr(term, "term") and hasattr(term, "direction"):
+        term, direction = term.term, term.direction
+    if isinstance(term, HamiltonianTerm):
+        return View(term.hamiltonian, args, direction)
+    if type(term).__name__ == "AdjointTerm":
+        raise ValueError(
+            "`BacksolveAdjoint()` solves the adjoint equations, which are not "
+            "Hamiltonian, with the same solver. Write "
+            "`BacksolveAdjoint(solver=diffrax.Tsit5())`, or use the default "
+            "`RecursiveCheckpointAdjoint()`."
+        )
+    raise ValueError(
+        "Presymplectic solvers step a `HamiltonianTerm`, but got a "
+        f"`{type(term).__name__}`. Write `HamiltonianTerm(hamiltonian)`, or "
+        "`HamiltonianTerm(VectorField(velocity, force))` for a hand-written vector "
+        "field."
+    )
+
+
+def check_state(y: PyTree) -> None:
+    wanted = "The state must be a pair `(q, p)` of positions and momenta"
+    if not isinstance(y, tuple | list) or len(y) != 2:
+        raise ValueError(f"{wanted}, but got {_describe(y)}. Write `y0=(q0, p0)`.")
+    q, p = y
+    if _describe(q) != _describe(p):
+        raise ValueError(
+            f"{wanted} of one structure, shape and precision, but got q of "
+            f"{_describe(q)} and p of {_describe(p)}."
+        )
+    for leaf in jtu.tree_leaves(y):
+        if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+            raise ValueError(
+                f"{wanted} in real floating point, but got {_describe(q)}. Convert "
+                "them with `jnp.asarray(x, float)`, a complex number to its real and "
+                "imaginary parts."
+            )
+
+
+def _describe(tree) -> str:
+    describe = lambda x: f"{jnp.result_type(x)}{list(jnp.shape(x))}"
+    return str(jtu.tree_map(describe, tree)).replace("'", "")
