@@ -1,0 +1,183 @@
+"""What the tests share: the list of schemes, a few systems, and ways to run them."""
+
+import dataclasses
+import json
+import pathlib
+from typing import Any, Literal
+
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import optimistix as optx
+import pytest
+from jax.flatten_util import ravel_pytree
+
+import diffrax_presym as dps
+
+
+# What a scheme must know of the energy, and so which systems it can be tested on.
+Kind = Literal[
+    "frozen",  # T(t, p) + V(t, q), explicit; or anything, with a root finder
+    "split",  # a kinetic energy whose exact flow is known, and V(t, q)
+    "quadratic",  # a quadratic kinetic energy, and V(t, q)
+    "augmented",  # anything; the solver state holds a copy `(q, p)` in `carry[0]`
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class Scheme:
+    """A solver and what is claimed of it."""
+
+    name: str
+    solver: Any
+    order: int
+    evaluations: int  # of the force, per step
+    symmetric: bool = True
+    kind: Kind = "frozen"
+
+    def __repr__(self):
+        return self.name
+
+
+# A new scheme is one new line here.
+SCHEMES = [
+    Scheme("euler_A", dps.PresymplecticEuler("momentum"), 1, 1, symmetric=False),
+    Scheme("euler_B", dps.PresymplecticEuler("position"), 1, 1, symmetric=False),
+    Scheme("leapfrog_AB", dps.PresymplecticLeapfrog("momentum"), 2, 1),
+    Scheme("leapfrog_BA", dps.PresymplecticLeapfrog("position"), 2, 1),
+    Scheme("yoshida_4", dps.PresymplecticYoshida4(), 4, 3),
+    Scheme("yoshida_4_BA", dps.PresymplecticYoshida4("position"), 4, 3),
+    Scheme("suzuki_yoshida_4", dps.SuzukiYoshida(4), 4, 3),
+    Scheme("suzuki_yoshida_6", dps.SuzukiYoshida(6), 6, 9),
+    Scheme("suzuki_yoshida_8", dps.SuzukiYoshida(8), 8, 27),
+    Scheme("substeps", dps.Substeps(dps.PresymplecticLeapfrog(), 3), 2, 3),
+    Scheme("tao", dps.PresymplecticTao(), 2, 3, kind="augmented"),
+    Scheme("tao_fixed", dps.PresymplecticTao(5.0), 2, 3, kind="augmented"),
+    Scheme(
+        "tao_4",
+        dps.SuzukiYoshida(4, dps.PresymplecticTao(5.0)),
+        4,
+        9,
+        kind="augmented",
+    ),
+]
+
+# Schemes for any energy: those with frozen velocities, made implicit.
+_finder = optx.Newton(rtol=1e-12, atol=1e-12)
+IMPLICIT = [
+    Scheme(
+        "euler_A", dps.PresymplecticEuler("momentum", _finder), 1, 1, symmetric=False
+    ),
+    Scheme(
+        "euler_B", dps.PresymplecticEuler("position", _finder), 1, 1, symmetric=False
+    ),
+    Scheme("leapfrog_AB", dps.PresymplecticLeapfrog("momentum", _finder), 2, 1),
+    Scheme("leapfrog_BA", dps.PresymplecticLeapfrog("position", _finder), 2, 1),
+    Scheme("yoshida_4", dps.PresymplecticYoshida4("position", _finder), 4, 3),
+]
+
+
+def each(schemes=SCHEMES, *, kinds: tuple[Kind, ...] | None = None, symmetric=None):
+    """Parametrise a test over schemes; by default over all there are."""
+    chosen = [
+        scheme
+        for scheme in schemes
+        if (kinds is None or scheme.kind in kinds)
+        and (symmetric is None or scheme.symmetric == symmetric)
+    ]
+    return pytest.mark.parametrize("scheme", chosen, ids=repr)
+
+
+def reference(name: str):
+    path = pathlib.Path(__file__).with_name("reference.json")
+    return json.loads(path.read_text())[name]
+
+
+# Functions are defined once: a fresh closure would be traced and compiled again.
+
+
+def harmonic(t, q, args):
+    return jnp.sum(q**2) / 2
+
+
+def pendulum(t, q, args):
+    return jnp.sum(1 - jnp.cos(q))
+
+
+def henon_heiles(t, q, args):
+    return jnp.sum(q**2) / 2 + q[0] ** 2 * q[1] - q[1] ** 3 / 3
+
+
+def mixed_energy(t, q, p, args):
+    """Not a sum of kinetic and potential energy."""
+    return (1 + jnp.sum(q**2)) * (1 + jnp.sum(p**2)) / 2
+
+
+def oscillator(gamma=0.2):
+    return dps.ConformalHamiltonian(
+        dps.QuadraticKinetic(), harmonic, dps.ConstantDamping(gamma)
+    )
+
+
+@eqx.filter_jit
+def step(hamiltonian, solver, t0, t1, y, args=None):
+    """One step, afresh, and everything it returns, as `diffeqsolve` would call it."""
+    term = dps.HamiltonianTerm(hamiltonian)
+    carry = solver.init(term, t0, t1, y, args)
+    return solver.step(term, t0, t1, y, args, carry, made_jump=False)
+
+
+_AT_END = dfx.SaveAt(t1=True)
+
+
+@eqx.filter_jit
+def solve(
+    hamiltonian,
+    solver,
+    t0,
+    t1,
+    dt0,
+    y0,
+    args=None,
+    *,
+    saveat=_AT_END,
+    max_steps=4096,
+    **kwargs,
+):
+    """A solve, compiled once for all step sizes."""
+    return dfx.diffeqsolve(
+        dps.HamiltonianTerm(hamiltonian),
+        solver,
+        t0,
+        t1,
+        dt0,
+        y0,
+        args,
+        saveat=saveat,
+        max_steps=max_steps,
+        **kwargs,
+    )
+
+
+def trajectory(hamiltonian, solver, t0, t1, dt0, y0, args=None, **kwargs):
+    """Times, positions and momenta of every step, the start included."""
+    saveat = dfx.SaveAt(t0=True, steps=True)
+    sol = solve(hamiltonian, solver, t0, t1, dt0, y0, args, saveat=saveat, **kwargs)
+    assert sol.ts is not None and sol.ys is not None
+    taken = np.isfinite(np.asarray(sol.ts))
+    return sol.ts[taken], *(jtu.tree_map(lambda x: x[taken], sol.ys))
+
+
+def flat(tree):
+    """All leaves as one vector."""
+    return ravel_pytree(tree)[0]
+
+
+def assert_close(x, y, tolerance):
+    """Largest difference, relative to the largest entry where that exceeds one."""
+    assert jtu.tree_structure(x) == jtu.tree_structure(y)
+    x, y = np.asarray(flat(x), np.float64), np.asarray(flat(y), np.float64)
+    assert np.all(np.isfinite(x)) and np.all(np.isfinite(y))
+    assert np.max(np.abs(x - y)) <= tolerance * max(1, np.max(np.abs(y)))
