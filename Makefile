@@ -1,0 +1,94 @@
+# Every target sets up what it needs, in `.venv`, on a machine that has GNU make and
+# Python 3.11 or newer. `make help` lists them.
+
+# To choose the interpreter: `make PYTHON=/path/to/python test`.
+PYTHON ?=
+VENV := .venv
+OLDEST := .venv-oldest
+BIN := $(VENV)/bin
+PIP := -m pip --quiet --disable-pip-version-check install
+# Two processes: what a small machine has. `make test WORKERS=auto` takes all there are.
+WORKERS ?= 2
+
+EXAMPLES := $(sort $(filter-out examples/_%,$(wildcard examples/*.py)))
+BENCHMARKS := $(sort $(filter-out benchmarks/_%,$(wildcard benchmarks/*.py)))
+
+# No window is ever opened: figures go to files.
+export MPLBACKEND ?= Agg
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test oldest lint format docs serve examples bench clean
+# The targets share one environment, so never two at a time.
+.NOTPARALLEL:
+.DELETE_ON_ERROR:
+
+help:  ## List the targets
+	@sed -n 's/^\([a-z]*\):.*##  *\(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) \
+		| while IFS='|' read -r name text; do printf '%-16s %s\n' "$$name" "$$text"; done
+
+demo: $(VENV)/.with-examples  ## Print the quick start's table and save its picture
+	@$(BIN)/python examples/quickstart.py
+
+test: $(VENV)/.with-tests  ## Run all tests
+	@$(BIN)/python -m pytest -q -n $(WORKERS)
+
+oldest: $(OLDEST)/.installed  ## Run the fast tests with the oldest allowed dependencies
+	@$(OLDEST)/bin/python -m pytest -q -n $(WORKERS) -m "not slow"
+
+lint: $(VENV)/.with-lint  ## Check style and types
+	@$(BIN)/ruff check
+	@$(BIN)/ruff format --check
+	@$(BIN)/pyright --pythonpath $(BIN)/python
+
+format: $(VENV)/.with-lint  ## Mend the style where it can be mended
+	@$(BIN)/ruff check --fix
+	@$(BIN)/ruff format
+
+docs: $(VENV)/.with-docs  ## Build the documentation into site/
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs --quiet build --strict --clean
+	@echo "Documentation built: open site/index.html"
+
+serve: $(VENV)/.with-docs  ## Serve the documentation while you edit it
+	@$(BIN)/mkdocs serve
+
+examples: $(VENV)/.with-examples  ## Run every example, quickly
+	@set -e; for script in $(EXAMPLES); do \
+		echo "--- $$script --quick"; $(BIN)/python $$script --quick; \
+	done
+
+bench: $(VENV)/.with-benchmarks  ## Run every benchmark
+	@set -e; for script in $(BENCHMARKS); do \
+		echo "--- $$script"; $(BIN)/python $$script; \
+	done
+
+clean:  ## Remove the environments and everything that was built
+	@rm -rf $(VENV) $(OLDEST) site build dist .pytest_cache .ruff_cache *.egg-info
+	@find . -name __pycache__ -prune -exec rm -rf {} +
+
+# Once per set of extras, and again when the dependencies change.
+$(VENV)/.with-%: pyproject.toml | $(BIN)/pip
+	@echo "Installing diffrax_presym[$*] into $(VENV) ..."
+	@$(BIN)/python $(PIP) --editable '.[$*]'
+	@touch $@
+
+# A name on the path need not run: version managers leave stubs. So each is tried.
+$(BIN)/pip:
+	@for python in $(or $(PYTHON),python3.13 python3.12 python3.11 python3); do \
+		if "$$python" -c 'import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))' \
+			>/dev/null 2>&1; then \
+			echo "Creating $(VENV) with $$python ..."; \
+			exec "$$python" -m venv $(VENV); \
+		fi; \
+	done; \
+	echo "No usable Python found (tried: $(or $(PYTHON),python3.13 python3.12 python3.11 python3))." >&2; \
+	echo "Python 3.11 or newer is needed, with its venv module (on Debian and Ubuntu: apt-get install python3-venv). Name one by 'make PYTHON=/path/to/python ...'." >&2; \
+	exit 1
+
+# The versions that the lower bounds in `pyproject.toml` allow, not those of today.
+$(OLDEST)/.installed: pyproject.toml | $(BIN)/pip
+	@echo "Installing the oldest allowed dependencies into $(OLDEST) ..."
+	@$(BIN)/python $(PIP) uv
+	@$(BIN)/uv --quiet venv --clear --python $(BIN)/python $(OLDEST)
+	@$(BIN)/uv --quiet pip install --python $(OLDEST)/bin/python \
+		--resolution lowest-direct --editable '.[tests]'
+	@touch $@
