@@ -88,7 +88,10 @@ class View(eqx.Module):
         return self.hamiltonian.velocity(t, *y, self.args)
 
     def force(self, t, y: State):
-        return self.hamiltonian.force(t, *y, self.args)
+        force = self.hamiltonian.force(t, *y, self.args)
+        # Selecting between two arrays, although always the first, makes XLA store the
+        # force. It would rather recompute an elementwise force wherever it is used.
+        return jtu.tree_map(lambda f, q: jnp.where(t == t, f, q), force, y[0])
 
     def decay(self, t, h):
         """`exp(eta(t) - eta(t + h))`, from frame to frame; `None` without damping."""
