@@ -2,6 +2,7 @@ import math
 from decimal import Decimal, localcontext
 from typing import Literal
 
+import diffrax as dfx
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
@@ -71,7 +72,7 @@ class AbstractComposition(AbstractPresymplecticSolver[PyTree]):
         (y, carry), results = lax.scan(stage, (y, carry), (starts, ends, lengths))
         if results is not None:
             # The first stage to fail, or any if none did.
-            failed = jnp.argmax(results != type(results).successful)
+            failed = jnp.argmax(results != dfx.RESULTS.successful)
             results = jtu.tree_map(lambda x: x[failed], results)
         return y, carry, results
 
