@@ -47,9 +47,8 @@ SCHEMES = [
     Scheme("euler_B", dps.PresymplecticEuler("position"), 1, 1, symmetric=False),
     Scheme("leapfrog_AB", dps.PresymplecticLeapfrog("momentum"), 2, 1),
     Scheme("leapfrog_BA", dps.PresymplecticLeapfrog("position"), 2, 1),
-    Scheme("yoshida_4", dps.PresymplecticYoshida4(), 4, 3),
-    Scheme("yoshida_4_BA", dps.PresymplecticYoshida4("position"), 4, 3),
-    Scheme("suzuki_yoshida_4", dps.SuzukiYoshida(4), 4, 3),
+    Scheme("suzuki_yoshida_4", dps.PresymplecticYoshida4(), 4, 3),
+    Scheme("suzuki_yoshida_4_BA", dps.PresymplecticYoshida4("position"), 4, 3),
     Scheme("suzuki_yoshida_6", dps.SuzukiYoshida(6), 6, 9),
     Scheme("suzuki_yoshida_8", dps.SuzukiYoshida(8), 8, 27),
     Scheme("substeps", dps.Substeps(dps.PresymplecticLeapfrog(), 3), 2, 3),
@@ -75,7 +74,7 @@ IMPLICIT = [
     ),
     Scheme("leapfrog_AB", dps.PresymplecticLeapfrog("momentum", _finder), 2, 1),
     Scheme("leapfrog_BA", dps.PresymplecticLeapfrog("position", _finder), 2, 1),
-    Scheme("yoshida_4", dps.PresymplecticYoshida4("position", _finder), 4, 3),
+    Scheme("suzuki_yoshida_4", dps.PresymplecticYoshida4("position", _finder), 4, 3),
 ]
 
 
@@ -121,44 +120,28 @@ def oscillator(gamma=0.2):
     )
 
 
-@eqx.filter_jit
+# A Python number would be a constant of the compiled code: compile once for all times.
+
+
 def step(hamiltonian, solver, t0, t1, y, args=None):
     """One step, afresh, and everything it returns, as `diffeqsolve` would call it."""
+    return _step(hamiltonian, solver, *map(jnp.asarray, (t0, t1)), y, args)
+
+
+@eqx.filter_jit
+def _step(hamiltonian, solver, t0, t1, y, args):
     term = dps.HamiltonianTerm(hamiltonian)
     carry = solver.init(term, t0, t1, y, args)
     return solver.step(term, t0, t1, y, args, carry, made_jump=False)
 
 
-_AT_END = dfx.SaveAt(t1=True)
+def solve(hamiltonian, solver, t0, t1, dt0, y0, args=None, **kwargs):
+    """A solve, at most 4096 steps long, of which the end is saved."""
+    term = dps.HamiltonianTerm(hamiltonian)
+    return _solve(term, solver, *map(jnp.asarray, (t0, t1, dt0)), y0, args, **kwargs)
 
 
-@eqx.filter_jit
-def solve(
-    hamiltonian,
-    solver,
-    t0,
-    t1,
-    dt0,
-    y0,
-    args=None,
-    *,
-    saveat=_AT_END,
-    max_steps=4096,
-    **kwargs,
-):
-    """A solve, compiled once for all step sizes."""
-    return dfx.diffeqsolve(
-        dps.HamiltonianTerm(hamiltonian),
-        solver,
-        t0,
-        t1,
-        dt0,
-        y0,
-        args,
-        saveat=saveat,
-        max_steps=max_steps,
-        **kwargs,
-    )
+_solve = eqx.filter_jit(dfx.diffeqsolve)
 
 
 def trajectory(hamiltonian, solver, t0, t1, dt0, y0, args=None, **kwargs):
@@ -166,8 +149,9 @@ def trajectory(hamiltonian, solver, t0, t1, dt0, y0, args=None, **kwargs):
     saveat = dfx.SaveAt(t0=True, steps=True)
     sol = solve(hamiltonian, solver, t0, t1, dt0, y0, args, saveat=saveat, **kwargs)
     assert sol.ts is not None and sol.ys is not None
-    taken = np.isfinite(np.asarray(sol.ts))
-    return sol.ts[taken], *(jtu.tree_map(lambda x: x[taken], sol.ys))
+    sol = jtu.tree_map(np.asarray, (sol.ts, *sol.ys))
+    taken = np.isfinite(sol[0])
+    return jtu.tree_map(lambda x: x[taken], sol)
 
 
 def flat(tree):
