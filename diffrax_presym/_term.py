@@ -5,6 +5,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Inexact, PyTree
 
 from ._hamiltonian import AbstractHamiltonian
+from ._hamiltonian._damping import decay
 from ._misc import cast_to, tree_add, tree_scale
 
 
@@ -93,23 +94,13 @@ class View(eqx.Module):
         # force. It would rather recompute an elementwise force wherever it is used.
         return jtu.tree_map(lambda f, q: jnp.where(t == t, f, q), force, y[0])
 
-    def decay(self, t, h):
-        """`exp(eta(t) - eta(t + h))`, from frame to frame; `None` without damping."""
-        damping = self.hamiltonian.damping
-        if damping is None:
-            return None
-        increment = damping.increment(t, h)
-        if jnp.shape(increment) != ():
-            raise ValueError(
-                "The damping must be one number for the whole system, but has shape "
-                f"{jnp.shape(increment)}. The momenta share one frame; solve systems "
-                "with different dampings side by side with `jax.vmap`."
-            )
-        return jnp.exp(-increment)
-
     def move_frame(self, t, h, p: PyTree) -> PyTree:
         """`p` from the frame of `t` to the frame of `t + h`."""
-        return tree_scale(self.decay(t, h), p)
+        return tree_scale(decay(self.hamiltonian.damping, t, h), p)
+
+    def drift(self, t, h, y: State) -> State:
+        """The exact flow of the kinetic part, frame included."""
+        return self.hamiltonian.drift(t, h, *y, self.args)
 
     def slope(self, t, y: State, force=None) -> State:
         """The full vector field, of which the force may be known already."""

@@ -43,6 +43,20 @@ class AbstractHamiltonian(eqx.Module):
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         r"""The force $-\partial E / \partial q$, without the friction."""
 
+    @property
+    @abc.abstractmethod
+    def is_split(self) -> bool:
+        """Whether the energy is a part whose flow is known plus `V(t, q)`."""
+
+    @property
+    @abc.abstractmethod
+    def is_quadratic(self) -> bool:
+        """Whether that part is known to be a kinetic energy quadratic in `p`."""
+
+    @abc.abstractmethod
+    def drift(self, t: Time, h: Time, q: Q, p: P, args: PyTree = None) -> tuple[Q, P]:
+        """The exact flow of the kinetic part from `t` to `t + h`, frame included."""
+
     def log_scale(self, t: Time) -> Scalar:
         r"""The log scale $\eta(t)$; 0 for a system without damping."""
         return jnp.zeros_like(t) if self.damping is None else self.damping(t)

@@ -7,17 +7,30 @@ from .._misc import AbstractVar, scalar_fn, tree_scale
 from ._base import AbstractHamiltonian, P, Q
 from ._damping import AbstractDamping, as_damping, Scalar, Time
 from ._energy import Hamiltonian, SeparableHamiltonian
-from ._kinetic import AbstractKinetic, as_kinetic, CallableKinetic
+from ._kinetic import (
+    AbstractKinetic,
+    as_kinetic,
+    CallableKinetic,
+    integrate_velocity,
+)
 
 
 class _AbstractDamped(AbstractHamiltonian):
     """An undamped Hamiltonian seen from a moving frame."""
 
-    undamped: AbstractVar[AbstractHamiltonian]
+    undamped: AbstractVar[SeparableHamiltonian | Hamiltonian]
 
     @property
     def is_separable(self) -> bool:
         return self.undamped.is_separable
+
+    @property
+    def is_split(self) -> bool:
+        return self.undamped.is_split
+
+    @property
+    def is_quadratic(self) -> bool:
+        return self.undamped.is_quadratic
 
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         return self.undamped.energy(t, q, p, args)
@@ -27,6 +40,9 @@ class _AbstractDamped(AbstractHamiltonian):
 
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         return self.undamped.force(t, q, p, args)
+
+    def drift(self, t: Time, h: Time, q: Q, p: P, args: PyTree = None) -> tuple[Q, P]:
+        return self.undamped.damped_drift(t, h, q, p, args, self.damping)
 
 
 class ConformalHamiltonian(_AbstractDamped):
@@ -38,7 +54,7 @@ class ConformalHamiltonian(_AbstractDamped):
     $H(t, q, P) = e^{\eta(t)} E(t, q, e^{-\eta(t)} P)$. The energy may depend on time.
     """
 
-    undamped: AbstractHamiltonian
+    undamped: SeparableHamiltonian | Hamiltonian
     damping: AbstractDamping | None
 
     def __init__(
@@ -103,7 +119,7 @@ class DissipativeHamiltonian(_AbstractDamped):
     overflows in `float32` once $2 \eta_2$ exceeds 88.
     """
 
-    undamped: AbstractHamiltonian
+    undamped: SeparableHamiltonian | Hamiltonian
     damping: AbstractDamping | None
 
     def __init__(self, kinetic, potential, eta1, eta2, *, separable=True):
@@ -143,6 +159,10 @@ class _ScaledKinetic(AbstractKinetic):
     eta1: AbstractDamping
     eta2: AbstractDamping
 
+    @property
+    def is_quadratic(self) -> bool:
+        return self.kinetic.is_quadratic
+
     def _parts(self, t):
         eta2 = self.eta2(t)
         return jnp.exp(eta2 - self.eta1(t)), self.kinetic.rescale(eta2)
@@ -154,6 +174,14 @@ class _ScaledKinetic(AbstractKinetic):
     def velocity(self, t, p, args=None):
         scale, kinetic = self._parts(t)
         return tree_scale(scale, kinetic.velocity(t, p, args))
+
+    def displacement(self, t, h, p, args, damping):
+        if not self.is_quadratic:
+            return integrate_velocity(self.velocity, t, h, p, args, damping)
+        # The decay of exp(eta2 - eta1) and that of the frame, eta2, leave that of eta1.
+        scale, kinetic = self._parts(t)
+        dq = kinetic.displacement(t, h, p, args, self.eta1)
+        return tree_scale(scale, dq)
 
     def rescale(self, s):
         return _ScaledKinetic(self.kinetic.rescale(s), self.eta1, self.eta2)

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import PyTree
 
-from .._misc import match, scalar_fn
+from .._misc import match, scalar_fn, tree_add, tree_scale
 from ._base import AbstractHamiltonian, P, Q
-from ._damping import Scalar, Time
-from ._kinetic import AbstractKinetic, as_kinetic
+from ._damping import decay, Scalar, Time
+from ._kinetic import AbstractKinetic, as_kinetic, integrate_velocity
 
 
 def _check_callable(fn, name: str, signature: str, optional: bool = False):
@@ -59,6 +59,14 @@ class SeparableHamiltonian(AbstractHamiltonian):
     def is_separable(self) -> bool:
         return True
 
+    @property
+    def is_split(self) -> bool:
+        return True
+
+    @property
+    def is_quadratic(self) -> bool:
+        return self.velocity_fn is None and self.kinetic.is_quadratic
+
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         kinetic = scalar_fn(self.kinetic, "The kinetic energy")(t, p, args)
         potential = scalar_fn(self.potential, "The potential")(t, q, args)
@@ -75,6 +83,18 @@ class SeparableHamiltonian(AbstractHamiltonian):
             slope = jax.grad(scalar_fn(self.potential, "The potential"), argnums=1)
             return jtu.tree_map(jnp.negative, slope(t, q, args))
         return match(self.force_fn(t, q, args), q, "`force`", "`q`")
+
+    def drift(self, t: Time, h: Time, q: Q, p: P, args: PyTree = None) -> tuple[Q, P]:
+        return self.damped_drift(t, h, q, p, args, None)
+
+    def damped_drift(self, t, h, q, p, args, damping):
+        """The drift of the same energy in a moving frame."""
+        if self.velocity_fn is None:
+            dq = self.kinetic.displacement(t, h, p, args, damping)
+        else:
+            velocity = lambda t, p, args: self.velocity(t, q, p, args)
+            dq = integrate_velocity(velocity, t, h, p, args, damping)
+        return tree_add(q, 1, dq), tree_scale(decay(damping, t, h), p)
 
 
 class Hamiltonian(AbstractHamiltonian):
@@ -116,6 +136,14 @@ class Hamiltonian(AbstractHamiltonian):
     def is_separable(self) -> bool:
         return False
 
+    @property
+    def is_split(self) -> bool:
+        return False
+
+    @property
+    def is_quadratic(self) -> bool:
+        return False
+
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         return scalar_fn(self.energy_fn, "The energy")(t, q, p, args)
 
@@ -129,3 +157,13 @@ class Hamiltonian(AbstractHamiltonian):
             slope = jax.grad(self.energy, argnums=1)(t, q, p, args)
             return jtu.tree_map(jnp.negative, slope)
         return match(self.force_fn(t, q, p, args), q, "`force`", "`q`")
+
+    def drift(self, t: Time, h: Time, q: Q, p: P, args: PyTree = None) -> tuple[Q, P]:
+        return self.damped_drift(t, h, q, p, args, None)
+
+    def damped_drift(self, t, h, q, p, args, damping):
+        raise ValueError(
+            "`Hamiltonian(energy)` has no exact drift, because it is not split into a "
+            "kinetic and a potential part. Write `SeparableHamiltonian(kinetic, "
+            "potential)` if it is, or use a solver such as `PresymplecticTao()`."
+        )

@@ -9,11 +9,16 @@ import lineax as lx
 from jaxtyping import Array, Inexact, PyTree
 
 from .._misc import as_parameter, as_positive, cast_to, scalar_fn, tree_dot, tree_scale
-from ._damping import Scalar, Time
+from ._damping import AbstractDamping, decay, quadrature, Scalar, Time
 
 
 class AbstractKinetic(eqx.Module):
     """A kinetic energy `T(t, p, args)` that knows its velocity."""
+
+    @property
+    @abc.abstractmethod
+    def is_quadratic(self) -> bool:
+        """Whether the velocity is linear in `p`."""
 
     @abc.abstractmethod
     def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
@@ -22,6 +27,18 @@ class AbstractKinetic(eqx.Module):
     @abc.abstractmethod
     def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
         r"""The velocity $\partial T / \partial p$."""
+
+    @abc.abstractmethod
+    def displacement(
+        self,
+        t: Time,
+        h: Time,
+        p: PyTree,
+        args: PyTree,
+        damping: AbstractDamping | None,
+    ) -> PyTree:
+        """The integral of the velocity from `t` to `t + h`, while `p` is constant but
+        for its frame."""
 
     @abc.abstractmethod
     def rescale(self, s: Scalar) -> "AbstractKinetic":
@@ -57,6 +74,10 @@ class QuadraticKinetic(AbstractKinetic):
             mass = jtu.tree_map(lambda m: check(m)(m, "`QuadraticKinetic(mass)`"), mass)
         self.mass = mass
 
+    @property
+    def is_quadratic(self) -> bool:
+        return True
+
     def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
         energy = tree_dot(p, self.velocity(t, p, args))
         return energy / 2
@@ -76,6 +97,10 @@ class QuadraticKinetic(AbstractKinetic):
                 f"{jtu.tree_structure(mass)}."
             )
         return jtu.tree_map(_divide, p, mass)
+
+    def displacement(self, t, h, p, args, damping):
+        length = h if damping is None else damping.integral(t, h)
+        return tree_scale(length, self.velocity(t, p, args))
 
     def rescale(self, s: Scalar) -> "QuadraticKinetic":
         return self
@@ -135,6 +160,10 @@ class RelativisticKinetic(AbstractKinetic):
         rest = cast_to(self.mass, square) * cast_to(self.speed, square)
         return jnp.sqrt(square + rest**2)
 
+    @property
+    def is_quadratic(self) -> bool:
+        return False
+
     def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
         norm = self._norm(p)
         return cast_to(self.speed, norm) * norm
@@ -142,6 +171,11 @@ class RelativisticKinetic(AbstractKinetic):
     def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
         norm = self._norm(p)
         return tree_scale(cast_to(self.speed, norm) / norm, p)
+
+    def displacement(self, t, h, p, args, damping):
+        if damping is None:
+            return tree_scale(h, self.velocity(t, p, args))
+        return integrate_velocity(self.velocity, t, h, p, args, damping)
 
     def rescale(self, s: Scalar) -> "RelativisticKinetic":
         speed = self.speed * cast_to(jnp.exp(-s), self.speed)
@@ -154,11 +188,18 @@ class CallableKinetic(AbstractKinetic):
 
     fn: Callable
 
+    @property
+    def is_quadratic(self) -> bool:
+        return False
+
     def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
         return self.fn(t, p, args)
 
     def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
         return jax.grad(scalar_fn(self.fn, "The kinetic energy"), argnums=1)(t, p, args)
+
+    def displacement(self, t, h, p, args, damping):
+        return integrate_velocity(self.velocity, t, h, p, args, damping)
 
     def rescale(self, s: Scalar) -> "CallableKinetic":
         def rescaled(t, p, args):
@@ -166,6 +207,12 @@ class CallableKinetic(AbstractKinetic):
             return tree_scale(jnp.exp(-2 * s), energy)
 
         return CallableKinetic(rescaled)
+
+
+def integrate_velocity(velocity: Callable, t, h, p, args, damping) -> PyTree:
+    """The displacement by any velocity `velocity(t, p, args)`, by quadrature."""
+    moving = lambda s: velocity(t + s, tree_scale(decay(damping, t, s), p), args)
+    return quadrature(moving, h)
 
 
 def as_kinetic(kinetic) -> AbstractKinetic:

@@ -2,10 +2,11 @@ from collections.abc import Callable
 
 from jaxtyping import PyTree
 
-from .._misc import match
+from .._misc import match, tree_add, tree_scale
 from ._base import AbstractHamiltonian, P, Q
-from ._damping import AbstractDamping, as_damping, Scalar, Time
+from ._damping import AbstractDamping, as_damping, decay, Scalar, Time
 from ._energy import _check_callable
+from ._kinetic import integrate_velocity
 
 
 class VectorField(AbstractHamiltonian):
@@ -46,6 +47,14 @@ class VectorField(AbstractHamiltonian):
     def is_separable(self) -> bool:
         return True
 
+    @property
+    def is_split(self) -> bool:
+        return True
+
+    @property
+    def is_quadratic(self) -> bool:
+        return False
+
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         raise ValueError(
             "A `VectorField` has no energy: it knows only its velocity and force. If "
@@ -58,3 +67,8 @@ class VectorField(AbstractHamiltonian):
 
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         return match(self.force_fn(t, q, args), q, "`force`", "`q`")
+
+    def drift(self, t: Time, h: Time, q: Q, p: P, args: PyTree = None) -> tuple[Q, P]:
+        velocity = lambda t, p, args: self.velocity(t, q, p, args)
+        dq = integrate_velocity(velocity, t, h, p, args, self.damping)
+        return tree_add(q, 1, dq), tree_scale(decay(self.damping, t, h), p)

@@ -2,9 +2,22 @@ from ._base import AbstractPresymplecticSolver as AbstractPresymplecticSolver
 from ._composition import (
     Composition as Composition,
     PresymplecticYoshida4 as PresymplecticYoshida4,
+    SofroniouSpaletta6 as SofroniouSpaletta6,
+    SofroniouSpaletta8 as SofroniouSpaletta8,
+    SofroniouSpaletta10 as SofroniouSpaletta10,
     Substeps as Substeps,
+    Suzuki4 as Suzuki4,
     SuzukiYoshida as SuzukiYoshida,
 )
 from ._euler import PresymplecticEuler as PresymplecticEuler
 from ._leapfrog import PresymplecticLeapfrog as PresymplecticLeapfrog
+from ._splitting import (
+    BlanesCasasRKN8 as BlanesCasasRKN8,
+    BlanesMoan4 as BlanesMoan4,
+    BlanesMoan6 as BlanesMoan6,
+    BlanesMoanRKN4 as BlanesMoanRKN4,
+    BlanesMoanRKN6 as BlanesMoanRKN6,
+    Splitting as Splitting,
+)
+from ._tableaus import SplittingTableau as SplittingTableau
 from ._tao import PresymplecticTao as PresymplecticTao

@@ -1,6 +1,6 @@
 import math
 from decimal import Decimal, localcontext
-from typing import Literal
+from typing import ClassVar, Literal
 
 import diffrax as dfx
 import equinox as eqx
@@ -15,6 +15,13 @@ from .._misc import AbstractVar, cast_to
 from .._term import State, View
 from ._base import AbstractPresymplecticSolver
 from ._leapfrog import PresymplecticLeapfrog
+from ._tableaus import (
+    CompositionTableau,
+    SOFRONIOU_SPALETTA_6,
+    SOFRONIOU_SPALETTA_8,
+    SOFRONIOU_SPALETTA_10,
+    SUZUKI_4,
+)
 from ._tao import PresymplecticTao
 
 
@@ -239,6 +246,129 @@ class PresymplecticYoshida4(AbstractComposition):
 
 
 PresymplecticYoshida4.__init__.__doc__ = PresymplecticLeapfrog.__init__.__doc__
+
+
+class _AbstractTabulated(AbstractComposition):
+    tableau: AbstractVar[CompositionTableau]
+
+    @property
+    def weights(self) -> Weights:
+        return self.tableau.weights
+
+    def order(self, terms):
+        return self.tableau.order
+
+
+_BASE = """**Arguments:**
+
+- `base`: a symmetric presymplectic solver of second order. Defaults to
+    [`diffrax_presym.PresymplecticLeapfrog`][].
+
+**Raises:**
+
+`ValueError` if the base is not symmetric.
+"""
+
+
+class Suzuki4(_AbstractTabulated):
+    """Suzuki's fourth-order composition of five stages.
+
+    4th order, 5 stages, symmetric if its base is: with the default base 5 force
+    evaluations per step. Uses the base's dense/ts output.
+
+    Its error is several times smaller than that of the triple jump
+    ([`diffrax_presym.PresymplecticYoshida4`][]) at equal cost, and its stages stay
+    within the step.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{suzuki1990fractal,
+            author={Suzuki, Masuo},
+            title={Fractal decomposition of exponential operators with applications to
+                   many-body theories and {M}onte {C}arlo simulations},
+            journal={Physics Letters A},
+            volume={146},
+            number={6},
+            pages={319--323},
+            year={1990},
+        }
+        ```
+    """
+
+    base: AbstractPresymplecticSolver = PresymplecticLeapfrog()
+    tableau: ClassVar[CompositionTableau] = SUZUKI_4
+
+
+Suzuki4.__init__.__doc__ = _BASE
+
+
+class SofroniouSpaletta6(_AbstractTabulated):
+    """Sofroniou and Spaletta's sixth-order composition of thirteen stages.
+
+    6th order, 13 stages, symmetric if its base is: with the default base 13 force
+    evaluations per step. Uses the base's dense/ts output.
+
+    The composition to take at sixth order, whatever the base. If the kinetic part has a
+    known flow, a [`diffrax_presym.Splitting`][] is more accurate at equal cost.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{sofroniou2005derivation,
+            author={Sofroniou, Mark and Spaletta, Giulia},
+            title={Derivation of symmetric composition constants for symmetric
+                   integrators},
+            journal={Optimization Methods and Software},
+            volume={20},
+            number={4-5},
+            pages={597--613},
+            year={2005},
+        }
+        ```
+    """
+
+    base: AbstractPresymplecticSolver = PresymplecticLeapfrog()
+    tableau: ClassVar[CompositionTableau] = SOFRONIOU_SPALETTA_6
+
+
+SofroniouSpaletta6.__init__.__doc__ = _BASE
+
+
+class SofroniouSpaletta8(_AbstractTabulated):
+    """Sofroniou and Spaletta's eighth-order composition of twenty-one stages.
+
+    8th order, 21 stages, symmetric if its base is: with the default base 21 force
+    evaluations per step. Uses the base's dense/ts output.
+
+    The composition to take at eighth order, whatever the base.
+
+    Source: Sofroniou and Spaletta (2005), see [`diffrax_presym.SofroniouSpaletta6`][].
+    """
+
+    base: AbstractPresymplecticSolver = PresymplecticLeapfrog()
+    tableau: ClassVar[CompositionTableau] = SOFRONIOU_SPALETTA_8
+
+
+SofroniouSpaletta8.__init__.__doc__ = _BASE
+
+
+class SofroniouSpaletta10(_AbstractTabulated):
+    """Sofroniou and Spaletta's tenth-order composition of thirty-five stages.
+
+    10th order, 35 stages, symmetric if its base is: with the default base 35 force
+    evaluations per step. Uses the base's dense/ts output.
+
+    For errors close to rounding, where nothing of lower order gets with fewer stages.
+
+    Source: Sofroniou and Spaletta (2005), see [`diffrax_presym.SofroniouSpaletta6`][].
+    """
+
+    base: AbstractPresymplecticSolver = PresymplecticLeapfrog()
+    tableau: ClassVar[CompositionTableau] = SOFRONIOU_SPALETTA_10
+
+
+SofroniouSpaletta10.__init__.__doc__ = _BASE
 
 
 class Substeps(AbstractComposition):

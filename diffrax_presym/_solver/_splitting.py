@@ -1,0 +1,224 @@
+import math
+from typing import ClassVar
+
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from .._misc import AbstractVar, cast_to, tree_add
+from .._term import State, View
+from ._base import AbstractPresymplecticSolver
+from ._tableaus import (
+    BLANES_CASAS_RKN_8,
+    BLANES_MOAN_4,
+    BLANES_MOAN_6,
+    BLANES_MOAN_RKN_4,
+    BLANES_MOAN_RKN_6,
+    SplittingTableau,
+)
+
+
+class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
+    """Exact drifts and kicks by turns, each with a fraction of the step of its own."""
+
+    tableau: AbstractVar[SplittingTableau]
+
+    @property
+    def is_symmetric(self) -> bool:
+        return self.tableau.fractions == self.tableau.fractions[::-1]
+
+    def order(self, terms):
+        return self.tableau.order
+
+    def start(self, view: View, t, y: State):
+        self._check(view)
+        # The force that ends a step starts the next, if the step starts with a kick.
+        return view.force(t, y) if self.tableau.kick_first else None
+
+    def advance(self, view: View, t0, t1, h, y: State, carry: PyTree):
+        self._check(view)
+        fractions = self.tableau.fractions
+        kick_first = self.tableau.kick_first
+        if kick_first:
+            y = kick(y, fractions[0] * h, carry)
+            fractions = fractions[1:]
+        drifts, kicks = np.array(fractions[0::2]), np.array(fractions[1::2])
+        ends = t0 + cast_to(np.cumsum(drifts), h) * h
+        # Rounding must not make the last drift miss the end of the step.
+        ends = jnp.concatenate([ends[:-1], t1[None]])
+        starts = jnp.concatenate([t0[None], ends[:-1]])
+        drifts, kicks = cast_to(drifts, h) * h, cast_to(kicks, h) * h
+
+        def stage(state, moves):
+            start, end, drift, impulse = moves
+            y, _ = state
+            y = view.drift(start, drift, y)
+            force = view.force(end, y)
+            return (kick(y, impulse, force), force if kick_first else None), None
+
+        paired = tuple(x[: len(kicks)] for x in (starts, ends, drifts, kicks))
+        (y, carry), _ = lax.scan(stage, (y, carry), paired)
+        if not kick_first:
+            y = view.drift(starts[-1], drifts[-1], y)
+        return y, carry, None
+
+    def slope(self, view: View, t, y: State, carry: PyTree) -> State:
+        return view.slope(t, y, force=carry)
+
+    def _check(self, view: View) -> None:
+        name = type(self).__name__
+        if not view.hamiltonian.is_split:
+            raise ValueError(
+                f"`{name}` needs a Hamiltonian split into a kinetic part and a "
+                f"potential, but `{type(view.hamiltonian).__name__}` is not here. "
+                "Write it as a `SeparableHamiltonian(kinetic, potential)` if it is "
+                "one, or use `PresymplecticTao()`."
+            )
+        if self.tableau.quadratic and not view.hamiltonian.is_quadratic:
+            raise ValueError(
+                f"`{name}` keeps its order only for a kinetic energy quadratic in the "
+                "momentum, and known to be: write it as `QuadraticKinetic(mass)`. For "
+                "any other use `BlanesMoan4()` or `BlanesMoan6()`."
+            )
+
+
+class Splitting(AbstractSplitting):
+    """Any splitting into exact drifts and kicks, by a tableau of your own.
+
+    Order as the tableau claims; one force evaluation per kick, and one less if the step
+    starts with a kick. Uses 3rd order Hermite interpolation for dense/ts output.
+
+    For Hamiltonians whose kinetic part has a known flow. Where it has, these schemes
+    are far more accurate than compositions at equal cost.
+    """
+
+    tableau: SplittingTableau = eqx.field(static=True)
+
+    def __init__(self, tableau: SplittingTableau):
+        """**Arguments:**
+
+        - `tableau`: a [`diffrax_presym.SplittingTableau`][].
+
+        **Raises:**
+
+        `ValueError` if the drifts or the kicks do not sum to one, or do not take turns
+        from the first move to a last of the same kind.
+        """
+        first, second = tableau.fractions[0::2], tableau.fractions[1::2]
+        sums = math.fsum(first), math.fsum(second)
+        if len(first) != len(second) + 1 or any(abs(x - 1) > 1e-12 for x in sums):
+            raise ValueError(
+                "`SplittingTableau(fractions=...)` needs drifts that sum to one and "
+                "kicks that sum to one, by turns, an odd number of moves in all; but "
+                f"got {len(first)} of the first kind that sum to {sums[0]} and "
+                f"{len(second)} of the second that sum to {sums[1]}."
+            )
+        self.tableau = tableau
+
+
+class BlanesMoan4(AbstractSplitting):
+    """Blanes and Moan's fourth-order splitting S6, for any kinetic energy.
+
+    4th order and symmetric. Six force evaluations per step. Uses 3rd order
+    Hermite interpolation for dense/ts output, at the cost of two more.
+
+    For any Hamiltonian with a kinetic part of known flow, such as a relativistic one.
+    If that is quadratic, [`diffrax_presym.BlanesMoanRKN4`][] is more accurate still.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{blanes2002practical,
+            author={Blanes, Sergio and Moan, Per Christian},
+            title={Practical symplectic partitioned {R}unge--{K}utta and
+                   {R}unge--{K}utta--{N}ystr{\\"o}m methods},
+            journal={Journal of Computational and Applied Mathematics},
+            volume={142},
+            number={2},
+            pages={313--330},
+            year={2002},
+        }
+        ```
+    """
+
+    tableau: ClassVar[SplittingTableau] = BLANES_MOAN_4
+
+
+class BlanesMoan6(AbstractSplitting):
+    """Blanes and Moan's sixth-order splitting S10, for any kinetic energy.
+
+    6th order and symmetric. Ten force evaluations per step. Uses Hermite interpolation
+    for dense/ts output, at the cost of two more.
+
+    For any Hamiltonian with a kinetic part of known flow. If that is quadratic,
+    [`diffrax_presym.BlanesMoanRKN6`][] is more accurate still.
+
+    Source: Blanes and Moan (2002), see [`diffrax_presym.BlanesMoan4`][].
+    """
+
+    tableau: ClassVar[SplittingTableau] = BLANES_MOAN_6
+
+
+class BlanesMoanRKN4(AbstractSplitting):
+    """Blanes and Moan's fourth-order Runge--Kutta--Nyström splitting SRKN 6b.
+
+    4th order and symmetric. Six force evaluations per step. Uses 3rd order Hermite
+    interpolation for dense/ts output, at no cost.
+
+    For quadratic kinetic energies only, which it takes advantage of: the first choice
+    for moderate accuracy.
+
+    Source: Blanes and Moan (2002), see [`diffrax_presym.BlanesMoan4`][].
+    """
+
+    tableau: ClassVar[SplittingTableau] = BLANES_MOAN_RKN_4
+
+
+class BlanesMoanRKN6(AbstractSplitting):
+    """Blanes and Moan's sixth-order Runge--Kutta--Nyström splitting SRKN 14a.
+
+    6th order and symmetric. Fourteen force evaluations per step. Uses Hermite
+    interpolation for dense/ts output, at the cost of two more.
+
+    For quadratic kinetic energies only, which it takes advantage of: the first choice
+    for high accuracy.
+
+    Source: Blanes and Moan (2002), see [`diffrax_presym.BlanesMoan4`][].
+    """
+
+    tableau: ClassVar[SplittingTableau] = BLANES_MOAN_RKN_6
+
+
+class BlanesCasasRKN8(AbstractSplitting):
+    """The eighth-order Runge--Kutta--Nyström splitting of Blanes, Casas et al.
+
+    8th order and symmetric. Nineteen force evaluations per step. Uses Hermite
+    interpolation for dense/ts output, at the cost of two more.
+
+    For quadratic kinetic energies only, which it takes advantage of: the first choice
+    towards the limit of `float64`.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @misc{blanes2022symmetric,
+            author={Blanes, Sergio and Casas, Fernando and
+                    Escorihuela-Tom{\\`a}s, Alejandro},
+            title={{R}unge--{K}utta--{N}ystr{\\"o}m symplectic splitting methods of
+                   order 8},
+            year={2022},
+            eprint={2202.01541},
+            archivePrefix={arXiv},
+            primaryClass={math.NA},
+        }
+        ```
+    """
+
+    tableau: ClassVar[SplittingTableau] = BLANES_CASAS_RKN_8
+
+
+def kick(y: State, h, force: PyTree) -> State:
+    q, p = y
+    return q, tree_add(p, h, force)
