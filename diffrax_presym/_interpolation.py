@@ -7,18 +7,22 @@ from ._misc import cast_to
 
 
 class HermiteInterpolation(dfx.AbstractLocalInterpolation):
-    """Cubic Hermite interpolation of a step from its end values and end slopes.
+    """Hermite interpolation of a step from what is known at its two ends.
 
-    Third order, exact at both ends. `k0` and `k1` are the slopes times the length of
-    the step. (Diffrax's own cannot subtract values that are pytrees.)
+    Exact at both ends. Cubic from the slopes there, with an error of fourth order in
+    the step; quintic where the second derivatives are given too, with an error of
+    sixth order.
     """
 
     t0: PyTree
     t1: PyTree
     y0: PyTree
     y1: PyTree
+    # Slopes and second derivatives, times the length of the step and its square.
     k0: PyTree
     k1: PyTree
+    b0: PyTree = None
+    b1: PyTree = None
 
     def evaluate(self, t0, t1=None, left: bool = True) -> PyTree:
         del left
@@ -27,14 +31,20 @@ class HermiteInterpolation(dfx.AbstractLocalInterpolation):
             return jtu.tree_map(lambda a, b: b - a, start, end)
         # A step of no length, as in an empty solve, is all start.
         length = self.t1 - self.t0
-        s = jnp.where(
-            length == 0, 0, (t0 - self.t0) / jnp.where(length == 0, 1, length)
-        )
+        empty = length == 0
+        s = jnp.where(empty, 0, (t0 - self.t0) / jnp.where(empty, 1, length))
+        bends = () if self.b0 is None else (self.b0, self.b1)
+        ends = (self.y0, self.y1, self.k0, self.k1, *bends)
+        return jtu.tree_map(lambda *x: _hermite(cast_to(s, x[0]), *x), *ends)
 
-        def leaf(y0, y1, k0, k1):
-            u = cast_to(s, y0)
-            v = 1 - u
-            bend = (v - u) * (y1 - y0) - v * k0 + u * k1
-            return v * y0 + u * y1 - u * v * bend
 
-        return jtu.tree_map(leaf, self.y0, self.y1, self.k0, self.k1)
+def _hermite(s, y0, y1, k0, k1, b0=None, b1=None):
+    r = 1 - s
+    jump = y1 - y0
+    y = r * y0 + s * y1 - s * r * ((r - s) * jump - r * k0 + s * k1)
+    if b0 is None:
+        return y
+    # What the cubic misses of the second derivatives.
+    miss0 = b0 - (6 * jump - 4 * k0 - 2 * k1)
+    miss1 = b1 - (2 * k0 + 4 * k1 - 6 * jump)
+    return y + (s * r) ** 2 * (r * miss0 + s * miss1) / 2

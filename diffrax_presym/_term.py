@@ -1,5 +1,6 @@
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Inexact, PyTree
@@ -109,6 +110,10 @@ class View(eqx.Module):
         if damping is not None:
             force = tree_add(force, -damping.rate(t), y[1])
         return self.velocity(t, y), force
+
+    def bend(self, t, y: State, slope: State) -> State:
+        """The rate of change of the slope along the flow, the second derivative."""
+        return jax.jvp(self.slope, (t, y), (jnp.ones_like(t), slope))[1]
 
 
 def view(terms: PyTree, args: PyTree) -> View:

@@ -75,12 +75,15 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
             carry = lax.cond(made_jump, restart, lambda: solver_state)
         h = t1 - t0
         y1, new_carry, result = self.advance(system, t0, t1, h, y0, carry)
+        slope0 = self.slope(system, t0, y0, carry)
+        slope1 = self.slope(system, t1, y1, new_carry)
         dense_info = dict(
-            y0=y0,
-            y1=y1,
-            k0=tree_scale(h, self.slope(system, t0, y0, carry)),
-            k1=tree_scale(h, self.slope(system, t1, y1, new_carry)),
+            y0=y0, y1=y1, k0=tree_scale(h, slope0), k1=tree_scale(h, slope1)
         )
+        if self.order(terms) > 4:
+            bend0 = system.bend(t0, y0, slope0)
+            bend1 = system.bend(t1, y1, slope1)
+            dense_info |= dict(b0=tree_scale(h**2, bend0), b1=tree_scale(h**2, bend1))
         result = dfx.RESULTS.successful if result is None else result
         return y1, None, dense_info, new_carry, result
 

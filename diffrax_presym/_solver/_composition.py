@@ -90,8 +90,8 @@ class AbstractComposition(AbstractPresymplecticSolver[PyTree]):
 class Composition(AbstractComposition):
     """Any composition of a symmetric scheme with itself, by weights of your own.
 
-    Its cost per step is that of the base times the number of weights. Uses the base's
-    dense/ts output.
+    Its cost per step is that of the base times the number of weights. Uses Hermite
+    interpolation for dense/ts output, of 3rd order, or of 5th if `order` exceeds 4.
     """
 
     base: AbstractPresymplecticSolver
@@ -134,7 +134,8 @@ class SuzukiYoshida(AbstractComposition):
     r"""The triple jump of Suzuki and Yoshida, to any even order.
 
     Order as given; $3^{r/2 - 1}$ force evaluations per step at order $r$. Symmetric.
-    Uses 3rd order Hermite interpolation for dense/ts output.
+    Uses Hermite interpolation for dense/ts output, of 3rd order, or of 5th if `order`
+    exceeds 4.
 
     The scheme of the paper. Its error constants are large and its stages leave the
     step, by up to 0.35, 0.65 and 0.92 of its length at orders 4, 6 and 8, on either
@@ -274,7 +275,7 @@ class Suzuki4(_AbstractTabulated):
     """Suzuki's fourth-order composition of five stages.
 
     4th order, 5 stages, symmetric if its base is: with the default base 5 force
-    evaluations per step. Uses the base's dense/ts output.
+    evaluations per step. Uses Hermite interpolation for dense/ts output.
 
     Its error is several times smaller than that of the triple jump
     ([`diffrax_presym.PresymplecticYoshida4`][]) at equal cost, and its stages stay
@@ -307,7 +308,7 @@ class SofroniouSpaletta6(_AbstractTabulated):
     """Sofroniou and Spaletta's sixth-order composition of thirteen stages.
 
     6th order, 13 stages, symmetric if its base is: with the default base 13 force
-    evaluations per step. Uses the base's dense/ts output.
+    evaluations per step. Uses Hermite interpolation for dense/ts output.
 
     The composition to take at sixth order, whatever the base. If the kinetic part has a
     known flow, a [`diffrax_presym.Splitting`][] is more accurate at equal cost.
@@ -339,7 +340,7 @@ class SofroniouSpaletta8(_AbstractTabulated):
     """Sofroniou and Spaletta's eighth-order composition of twenty-one stages.
 
     8th order, 21 stages, symmetric if its base is: with the default base 21 force
-    evaluations per step. Uses the base's dense/ts output.
+    evaluations per step. Uses Hermite interpolation for dense/ts output.
 
     The composition to take at eighth order, whatever the base.
 
@@ -357,7 +358,7 @@ class SofroniouSpaletta10(_AbstractTabulated):
     """Sofroniou and Spaletta's tenth-order composition of thirty-five stages.
 
     10th order, 35 stages, symmetric if its base is: with the default base 35 force
-    evaluations per step. Uses the base's dense/ts output.
+    evaluations per step. Uses Hermite interpolation for dense/ts output.
 
     For errors close to rounding, where nothing of lower order gets with fewer stages.
 

@@ -88,7 +88,8 @@ class Splitting(AbstractSplitting):
     """Any splitting into exact drifts and kicks, by a tableau of your own.
 
     Order as the tableau claims; one force evaluation per kick, and one less if the step
-    starts with a kick. Uses 3rd order Hermite interpolation for dense/ts output.
+    starts with a kick. Uses Hermite interpolation for dense/ts output, of 3rd order, or of
+    5th if the order of the scheme exceeds 4.
 
     For Hamiltonians whose kinetic part has a known flow. Where it has, these schemes
     are far more accurate than compositions at equal cost.
@@ -149,8 +150,9 @@ class BlanesMoan4(AbstractSplitting):
 class BlanesMoan6(AbstractSplitting):
     """Blanes and Moan's sixth-order splitting S10, for any kinetic energy.
 
-    6th order and symmetric. Ten force evaluations per step. Uses Hermite interpolation
-    for dense/ts output, at the cost of two more.
+    6th order and symmetric. Ten force evaluations per step. Uses 5th order Hermite
+    interpolation for dense/ts output, at the cost of the force and its derivative along
+    the flow at both ends.
 
     For any Hamiltonian with a kinetic part of known flow. If that is quadratic,
     [`diffrax_presym.BlanesMoanRKN6`][] is more accurate still.
@@ -179,8 +181,9 @@ class BlanesMoanRKN4(AbstractSplitting):
 class BlanesMoanRKN6(AbstractSplitting):
     """Blanes and Moan's sixth-order Runge--Kutta--Nyström splitting SRKN 14a.
 
-    6th order and symmetric. Fourteen force evaluations per step. Uses Hermite
-    interpolation for dense/ts output, at the cost of two more.
+    6th order and symmetric. Fourteen force evaluations per step. Uses 5th order
+    Hermite interpolation for dense/ts output, at the cost of the force and its derivative
+    along the flow at both ends.
 
     For quadratic kinetic energies only, which it takes advantage of: the first choice
     for high accuracy.
@@ -194,8 +197,9 @@ class BlanesMoanRKN6(AbstractSplitting):
 class BlanesCasasRKN8(AbstractSplitting):
     """The eighth-order Runge--Kutta--Nyström splitting of Blanes, Casas et al.
 
-    8th order and symmetric. Nineteen force evaluations per step. Uses Hermite
-    interpolation for dense/ts output, at the cost of two more.
+    8th order and symmetric. Nineteen force evaluations per step. Uses 5th order
+    Hermite interpolation for dense/ts output, at the cost of the force and its derivative
+    along the flow at both ends.
 
     For quadratic kinetic energies only, which it takes advantage of: the first choice
     towards the limit of `float64`.
