@@ -1,0 +1,133 @@
+"""What the documentation shows runs, and what is public is documented."""
+
+import inspect
+import pathlib
+import re
+import textwrap
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+import optimistix as optx
+import pytest
+
+import diffrax_presym as dps
+
+
+ROOT = pathlib.Path(__file__).parent.parent
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+PUBLIC = {
+    name: value
+    for name, value in vars(dps).items()
+    if not name.startswith("_") and not inspect.ismodule(value)
+}
+FENCE = re.compile(
+    r"^(?P<indent> *)```(?P<language>[^\n`]*)\n(?P<code>.*?)^(?P=indent)```$",
+    re.DOTALL | re.MULTILINE,
+)
+REFERENCE = re.compile(r"\[`?(diffrax_presym\.\w+)`?\]\[|\]\[(diffrax_presym\.\w+)\]")
+
+
+def python_blocks(text):
+    found = FENCE.finditer(text)
+    return [textwrap.dedent(x["code"]) for x in found if x["language"] == "python"]
+
+
+def docstrings(value):
+    """The docstring of an object, and of what it defines itself."""
+    members = vars(value).values() if inspect.isclass(value) else ()
+    objects = [value, *(x for x in members if callable(x) or isinstance(x, property))]
+    return [inspect.getdoc(x) or "" for x in objects]
+
+
+@pytest.fixture
+def as_user(tmp_path, monkeypatch):
+    """JAX as it is imported, and a place to save figures to."""
+    settings = {
+        "jax_enable_x64": False,
+        "jax_numpy_dtype_promotion": "standard",
+        "jax_numpy_rank_promotion": "allow",
+    }
+    before = {name: getattr(jax.config, name) for name in settings}
+    backend = matplotlib.get_backend()
+    monkeypatch.chdir(tmp_path)
+    plt.switch_backend("Agg")
+    for name, value in settings.items():
+        jax.config.update(name, value)
+    yield
+    plt.close("all")
+    plt.switch_backend(backend)
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+def run(blocks, name, namespace):
+    for number, block in enumerate(blocks, 1):
+        exec(compile(block, f"{name}, block {number}", "exec"), namespace)
+
+
+# `plt.show()` shows nothing here, and says so.
+@pytest.mark.filterwarnings("ignore:.*is non-interactive:UserWarning")
+@pytest.mark.parametrize("page", PAGES, ids=lambda x: str(x.relative_to(ROOT)))
+def test_page_runs(page, as_user):
+    run(python_blocks(page.read_text()), page.name, {"__name__": "__main__"})
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_docstring_runs(name, as_user):
+    blocks = [x for doc in docstrings(PUBLIC[name]) for x in python_blocks(doc)]
+    # Docstrings leave out the imports that anyone would guess.
+    usual = {"dfx": dfx, "dps": dps, "eqx": eqx, "jax": jax, "jnp": jnp, "np": np}
+    run(blocks, name, {**vars(dfx), **PUBLIC, **usual, "optx": optx})
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda x: str(x.relative_to(ROOT)))
+def test_blocks_say_their_language(page):
+    languages = {x["language"] for x in FENCE.finditer(page.read_text())}
+    assert languages <= {"bash", "bibtex", "python", "sh", "text"}
+
+
+def test_every_public_name_is_in_the_api():
+    api = "\n".join(x.read_text() for x in (ROOT / "docs" / "api").glob("*.md"))
+    shown = re.findall(r"^::: diffrax_presym\.([\w.]+)$", api, re.MULTILINE)
+    assert len(shown) == len(set(shown))
+    assert set(shown) == set(PUBLIC)
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_docstring_is_complete(name):
+    value = PUBLIC[name]
+    doc = inspect.getdoc(value)
+    assert doc and doc.splitlines()[0]
+    assert value.__doc__, "inherited, not its own"
+    if issubclass(value, dps.AbstractPresymplecticSolver) and value is not (
+        dps.AbstractPresymplecticSolver
+    ):
+        assert re.search(r"\border\b|\bcost per step\b", doc, re.IGNORECASE)
+        assert "dense/ts output" in doc.replace("\n", " ").lower()
+    # Whatever a user calls with arguments documents each of them.
+    if inspect.isabstract(value) or name in DOCUMENTED_AS_A_WHOLE:
+        return
+    arguments = list(inspect.signature(value).parameters)
+    explained = (value.__init__.__doc__ or "").replace("\n", " ")
+    if arguments:
+        assert "**Arguments:**" in explained
+    for argument in arguments:
+        assert f"`{argument}`" in explained, argument
+
+
+# Records, whose fields the docstring of the class explains; made by no user.
+DOCUMENTED_AS_A_WHOLE = {"HermiteInterpolation", "SplittingTableau"}
+
+
+def test_references_resolve():
+    texts = {str(x.relative_to(ROOT)): x.read_text() for x in PAGES}
+    texts |= {name: "\n".join(docstrings(value)) for name, value in PUBLIC.items()}
+    for where, text in texts.items():
+        for groups in REFERENCE.findall(text):
+            name = "".join(groups).removeprefix("diffrax_presym.")
+            assert name in PUBLIC, f"{where} refers to {name}"
