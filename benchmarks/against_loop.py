@@ -10,10 +10,11 @@ import statistics
 import time
 
 import diffrax as dfx
-import diffrax_presym as dps
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
+
+import diffrax_presym as dps
 
 
 jax.config.update("jax_enable_x64", True)
@@ -101,8 +102,10 @@ def main():
     if quick:
         sizes = {n: steps // 100 for n, steps in sizes.items()}
     leapfrog = dps.PresymplecticLeapfrog()
-    print(f"{'potential':>10} {'unknowns':>8} {'saved':>34} {'ours':>10} {'loop':>10}"
-          f" {'ratio':>6}")
+    print(
+        f"{'potential':>10} {'unknowns':>8} {'saved':>34} {'ours':>10} {'loop':>10}"
+        f" {'ratio':>6}"
+    )
     for name, potential in POTENTIALS.items():
         loop = hand_loop(potential)
         for n, steps in sizes.items():
