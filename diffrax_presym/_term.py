@@ -6,7 +6,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Inexact, PyTree
 
 from ._hamiltonian import AbstractHamiltonian
-from ._hamiltonian._damping import decay
+from ._hamiltonian._damping import move_frame
 from ._misc import cast_to, tree_add, tree_scale
 
 
@@ -97,7 +97,7 @@ class View(eqx.Module):
 
     def move_frame(self, t, h, p: PyTree) -> PyTree:
         """`p` from the frame of `t` to the frame of `t + h`."""
-        return tree_scale(decay(self.hamiltonian.damping, t, h), p)
+        return move_frame(self.hamiltonian.damping, t, h, p)
 
     def drift(self, t, h, y: State) -> State:
         """The exact flow of the kinetic part, frame included."""

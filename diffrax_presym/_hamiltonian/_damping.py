@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Inexact, PyTree, Real
 
-from .._misc import as_parameter, cast_to, tree_scale
+from .._misc import as_parameter, cast_to, tree_add, tree_scale
 
 
 Time = Real[Array, ""]
@@ -182,10 +182,10 @@ class CallableDamping(AbstractDamping):
         return quadrature(lambda s: jnp.exp(-self.increment(t, s)), h)
 
 
-def decay(damping: AbstractDamping | None, t: Time, h: Time) -> Scalar | None:
-    """`exp(eta(t) - eta(t + h))`, from frame to frame; `None` without damping."""
+def move_frame(damping: AbstractDamping | None, t: Time, h: Time, p: PyTree) -> PyTree:
+    """`exp(eta(t) - eta(t + h)) p`: from the frame of `t` to the frame of `t + h`."""
     if damping is None:
-        return None
+        return p
     increment = damping.increment(t, h)
     if jnp.shape(increment) != ():
         raise ValueError(
@@ -193,7 +193,9 @@ def decay(damping: AbstractDamping | None, t: Time, h: Time) -> Scalar | None:
             f"{jnp.shape(increment)}. The momenta share one frame; solve systems with "
             "different dampings side by side with `jax.vmap`."
         )
-    return jnp.exp(-increment)
+    # As a factor, rounding would make the same error at every step, and errors that are
+    # the same add up. As an increment they vary with `p`, and mostly cancel.
+    return tree_add(p, jnp.expm1(-increment), p)
 
 
 # Gauss-Legendre with four nodes integrates with an error of order nine in the length:

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import PyTree
 
-from .._misc import match, scalar_fn, tree_add, tree_scale
+from .._misc import match, scalar_fn, tree_add
 from ._base import AbstractHamiltonian, P, Q
-from ._damping import decay, Scalar, Time
+from ._damping import move_frame, Scalar, Time
 from ._kinetic import AbstractKinetic, as_kinetic, integrate_velocity
 
 
@@ -94,7 +94,7 @@ class SeparableHamiltonian(AbstractHamiltonian):
         else:
             velocity = lambda t, p, args: self.velocity(t, q, p, args)
             dq = integrate_velocity(velocity, t, h, p, args, damping)
-        return tree_add(q, 1, dq), tree_scale(decay(damping, t, h), p)
+        return tree_add(q, 1, dq), move_frame(damping, t, h, p)
 
 
 class Hamiltonian(AbstractHamiltonian):

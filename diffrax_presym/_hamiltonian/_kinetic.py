@@ -9,7 +9,7 @@ import lineax as lx
 from jaxtyping import Array, Inexact, PyTree
 
 from .._misc import as_parameter, as_positive, cast_to, scalar_fn, tree_dot, tree_scale
-from ._damping import AbstractDamping, decay, quadrature, Scalar, Time
+from ._damping import AbstractDamping, move_frame, quadrature, Scalar, Time
 
 
 class AbstractKinetic(eqx.Module):
@@ -211,7 +211,7 @@ class CallableKinetic(AbstractKinetic):
 
 def integrate_velocity(velocity: Callable, t, h, p, args, damping) -> PyTree:
     """The displacement by any velocity `velocity(t, p, args)`, by quadrature."""
-    moving = lambda s: velocity(t + s, tree_scale(decay(damping, t, s), p), args)
+    moving = lambda s: velocity(t + s, move_frame(damping, t, s, p), args)
     return quadrature(moving, h)
 
 

@@ -2,9 +2,9 @@ from collections.abc import Callable
 
 from jaxtyping import PyTree
 
-from .._misc import match, tree_add, tree_scale
+from .._misc import match, tree_add
 from ._base import AbstractHamiltonian, P, Q
-from ._damping import AbstractDamping, as_damping, decay, Scalar, Time
+from ._damping import AbstractDamping, as_damping, move_frame, Scalar, Time
 from ._energy import _check_callable
 from ._kinetic import integrate_velocity
 
@@ -71,4 +71,4 @@ class VectorField(AbstractHamiltonian):
     def drift(self, t: Time, h: Time, q: Q, p: P, args: PyTree = None) -> tuple[Q, P]:
         velocity = lambda t, p, args: self.velocity(t, q, p, args)
         dq = integrate_velocity(velocity, t, h, p, args, self.damping)
-        return tree_add(q, 1, dq), tree_scale(decay(self.damping, t, h), p)
+        return tree_add(q, 1, dq), move_frame(self.damping, t, h, p)
