@@ -12,11 +12,12 @@ import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 import optimistix as optx
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from .._interpolation import HermiteInterpolation
-from .._misc import AbstractVar, tree_add, tree_scale
+from .._misc import AbstractVar, cast_to, tree_add, tree_scale
 from .._term import check_state, State, View, view
 
 
@@ -89,6 +90,31 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
 
     def func(self, terms, t0, y0, args):
         return terms.vf(t0, y0, args)
+
+
+class Clock(eqx.Module):
+    """The time at a fraction of a step."""
+
+    t0: Array
+    t1: Array
+    h: Array
+
+    def __call__(self, c):
+        # Rounding must not make the last stage miss the end of the step.
+        return jnp.where(c == 1, self.t1, self.t0 + c * self.h)
+
+
+def stage_table(fractions, like) -> tuple[Array, Array, Array]:
+    """Where each stage of a step starts and ends, and its length, as fractions of it.
+
+    Constants, to be multiplied by the step inside the loop over the stages: a table
+    made anew at each step was measured to take as long as the stages themselves.
+    """
+    ends = np.cumsum(fractions)
+    ends[-1] = 1
+    starts = np.concatenate([[0], ends[:-1]])
+    lengths = np.array(fractions)
+    return cast_to(starts, like), cast_to(ends, like), cast_to(lengths, like)
 
 
 class AbstractKickDriftSolver(AbstractPresymplecticSolver[_Carry]):

@@ -7,13 +7,12 @@ import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 import optimistix as optx
 from jaxtyping import PyTree
 
-from .._misc import AbstractVar, cast_to
+from .._misc import AbstractVar
 from .._term import State, View
-from ._base import AbstractPresymplecticSolver
+from ._base import AbstractPresymplecticSolver, Clock, stage_table
 from ._leapfrog import PresymplecticLeapfrog
 from ._tableaus import (
     CompositionTableau,
@@ -66,17 +65,16 @@ class AbstractComposition(AbstractPresymplecticSolver[PyTree]):
         return self.base.start(view, t, y)
 
     def advance(self, view: View, t0, t1, h, y: State, carry: PyTree):
-        ends = t0 + cast_to(np.cumsum(self.weights), h) * h
-        # Rounding must not make the last stage miss the end of the step.
-        ends = jnp.concatenate([ends[:-1], t1[None]])
-        starts = jnp.concatenate([t0[None], ends[:-1]])
-        lengths = cast_to(np.array(self.weights), h) * h
+        clock = Clock(t0, t1, h)
 
-        def stage(state, times):
+        def stage(state, moves):
+            start, end, weight = moves
+            times = clock(start), clock(end), weight * h
             y, carry, result = self.base.advance(view, *times, *state)
             return (y, carry), result
 
-        (y, carry), results = lax.scan(stage, (y, carry), (starts, ends, lengths))
+        stages = stage_table(self.weights, h)
+        (y, carry), results = lax.scan(stage, (y, carry), stages)
         if results is not None:
             # The first stage to fail, or any if none did.
             failed = jnp.argmax(results != dfx.RESULTS.successful)

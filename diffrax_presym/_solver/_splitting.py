@@ -3,13 +3,12 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.lax as lax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
 from .._misc import AbstractVar, cast_to, tree_add
 from .._term import State, View
-from ._base import AbstractPresymplecticSolver
+from ._base import AbstractPresymplecticSolver, Clock, stage_table
 from ._tableaus import (
     BLANES_CASAS_RKN_8,
     BLANES_MOAN_4,
@@ -44,24 +43,22 @@ class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
         if kick_first:
             y = kick(y, fractions[0] * h, carry)
             fractions = fractions[1:]
-        drifts, kicks = np.array(fractions[0::2]), np.array(fractions[1::2])
-        ends = t0 + cast_to(np.cumsum(drifts), h) * h
-        # Rounding must not make the last drift miss the end of the step.
-        ends = jnp.concatenate([ends[:-1], t1[None]])
-        starts = jnp.concatenate([t0[None], ends[:-1]])
-        drifts, kicks = cast_to(drifts, h) * h, cast_to(kicks, h) * h
+        drifts, kicks = fractions[0::2], fractions[1::2]
+        clock = Clock(t0, t1, h)
 
         def stage(state, moves):
             start, end, drift, impulse = moves
             y, _ = state
-            y = view.drift(start, drift, y)
-            force = view.force(end, y)
-            return (kick(y, impulse, force), force if kick_first else None), None
+            y = view.drift(clock(start), drift * h, y)
+            force = view.force(clock(end), y)
+            return (kick(y, impulse * h, force), force if kick_first else None), None
 
-        paired = tuple(x[: len(kicks)] for x in (starts, ends, drifts, kicks))
+        table = stage_table(drifts, h)
+        paired = *(x[: len(kicks)] for x in table), cast_to(np.array(kicks), h)
         (y, carry), _ = lax.scan(stage, (y, carry), paired)
         if not kick_first:
-            y = view.drift(starts[-1], drifts[-1], y)
+            start, _, drift = (x[-1] for x in table)
+            y = view.drift(clock(start), drift * h, y)
         return y, carry, None
 
     def slope(self, view: View, t, y: State, carry: PyTree) -> State:
@@ -88,8 +85,8 @@ class Splitting(AbstractSplitting):
     """Any splitting into exact drifts and kicks, by a tableau of your own.
 
     Order as the tableau claims; one force evaluation per kick, and one less if the step
-    starts with a kick. Uses Hermite interpolation for dense/ts output, of 3rd order, or of
-    5th if the order of the scheme exceeds 4.
+    starts with a kick. Uses Hermite interpolation for dense/ts output, of 3rd order, or
+    of 5th if the order of the scheme exceeds 4.
 
     For Hamiltonians whose kinetic part has a known flow. Where it has, these schemes
     are far more accurate than compositions at equal cost.
@@ -182,8 +179,8 @@ class BlanesMoanRKN6(AbstractSplitting):
     """Blanes and Moan's sixth-order Runge--Kutta--Nyström splitting SRKN 14a.
 
     6th order and symmetric. Fourteen force evaluations per step. Uses 5th order
-    Hermite interpolation for dense/ts output, at the cost of the force and its derivative
-    along the flow at both ends.
+    Hermite interpolation for dense/ts output, at the cost of the force and its
+    derivative along the flow at both ends.
 
     For quadratic kinetic energies only, which it takes advantage of: the first choice
     for high accuracy.
@@ -198,8 +195,8 @@ class BlanesCasasRKN8(AbstractSplitting):
     """The eighth-order Runge--Kutta--Nyström splitting of Blanes, Casas et al.
 
     8th order and symmetric. Nineteen force evaluations per step. Uses 5th order
-    Hermite interpolation for dense/ts output, at the cost of the force and its derivative
-    along the flow at both ends.
+    Hermite interpolation for dense/ts output, at the cost of the force and its
+    derivative along the flow at both ends.
 
     For quadratic kinetic energies only, which it takes advantage of: the first choice
     towards the limit of `float64`.
