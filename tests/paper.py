@@ -5,6 +5,8 @@ respect to `P` and `q`. Implicit equations are solved by iteration, which for a
 separable system is exact after one.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 
@@ -107,7 +109,7 @@ def tao(coupling):
 fixed_tao = tao(lambda h: 5.0)
 
 # By the names in `helpers.SCHEMES`.
-SCHEMES = {
+SCHEMES: dict[str, Callable[..., tuple]] = {
     "euler_A": euler_A,
     "euler_B": euler_B,
     "leapfrog_AB": leapfrog_AB,

@@ -269,19 +269,20 @@ def check_canonical(scheme: Scheme, hamiltonian, H, tolerance):
         y = paper.SCHEMES[scheme.name](H, t, h, *y)
     q = np.array([q for q, _ in expected])
     p = np.array([p for _, p in expected])
-    _, *solution = trajectory(
-        hamiltonian, scheme.solver, t0, t0 + steps * h, h, (Q0, P0)
-    )
+    t1 = t0 + steps * h
+    _, *solution = trajectory(hamiltonian, scheme.solver, t0, t1, h, (Q0, P0))
     assert_close(solution, [q, p], tolerance)
 
 
 @pytest.mark.parametrize("pair", PAIRS)
 @each([scheme for scheme in SCHEMES if scheme.name in paper.SCHEMES])
 def test_solution_is_the_paper_s_in_canonical_momentum(scheme: Scheme, pair):
-    check_canonical(scheme, *PAIRS[pair], 1e-12)
+    hamiltonian, H = PAIRS[pair]
+    check_canonical(scheme, hamiltonian, H, 1e-12)
 
 
 @each([*IMPLICIT, *AUGMENTED])
 def test_nonseparable_solution_is_the_paper_s(scheme: Scheme):
     tolerance = 1e-12 if scheme.kind == "augmented" else 1e-10
-    check_canonical(scheme, *ENTANGLED, tolerance)
+    hamiltonian, H = ENTANGLED
+    check_canonical(scheme, hamiltonian, H, tolerance)

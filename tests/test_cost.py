@@ -1,0 +1,150 @@
+"""What a step costs: evaluations of the force, counted at run time."""
+
+from typing import Any
+
+import diffrax as dfx
+import jax
+import jax.extend as jex
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import each, harmonic, oscillator, Scheme, SCHEMES, solve
+
+import diffrax_presym as dps
+
+
+class Counter:
+    """Velocity and force of an oscillator that count how often they are computed.
+
+    A pure callback, because XLA drops it where its value is not used, as it drops any
+    other force: the slopes for dense output of a solve that saves only its end, say. A
+    debugging callback has an effect and would be counted although nobody needs it.
+    """
+
+    def __init__(self):
+        self.velocities, self.forces = 0, 0
+
+    def velocity(self, t, p, args):
+        return self._count("velocities", p)
+
+    def force(self, t, q, args):
+        return -self._count("forces", q)
+
+    def _count(self, name, x):
+        def count(x):
+            setattr(self, name, getattr(self, name) + 1)
+            return np.asarray(x)
+
+        @jax.custom_jvp
+        def counted(x):
+            return jax.pure_callback(count, jax.ShapeDtypeStruct(x.shape, x.dtype), x)
+
+        # Dense output of high order differentiates the vector field.
+        counted.defjvp(lambda x, dx: (counted(*x), *dx))
+        return counted(x)
+
+
+STEPS = 8
+
+
+def count(solver, **kwargs):
+    counter = Counter()
+    system = dps.VectorField(counter.velocity, counter.force, dps.ConstantDamping(0.1))
+    y0 = (jnp.array([1.0]), jnp.array([0.0]))
+    sol = solve(system, solver, 0.0, 1.0, 1 / STEPS, y0, **kwargs)
+    jax.block_until_ready(sol.ys)
+    return counter
+
+
+@each(kinds=("frozen", "split", "augmented"))
+def test_force_evaluations_per_step(scheme: Scheme):
+    forces = count(scheme.solver).forces
+    # What a step ends with may start the next; the first has to be computed.
+    assert forces in (STEPS * scheme.evaluations, STEPS * scheme.evaluations + 1)
+
+
+@each(kinds=("augmented",))
+def test_velocity_evaluations_per_step_of_augmented_schemes(scheme: Scheme):
+    assert count(scheme.solver).velocities == STEPS * scheme.evaluations + 1
+
+
+@pytest.mark.parametrize("order", [2, 4, 6, 8])
+def test_triple_jumps_take_powers_of_three(order):
+    assert len(dps.SuzukiYoshida(order).weights) == 3 ** (order // 2 - 1)
+
+
+@pytest.mark.parametrize("first, extra", [("momentum", 0), ("position", 2)])
+def test_dense_output_of_the_leapfrog(first, extra):
+    solver = dps.PresymplecticLeapfrog(first)
+    plain = count(solver).forces
+    dense = count(solver, saveat=dfx.SaveAt(ts=jnp.array([0.3, 0.9]))).forces
+    assert dense - plain == extra * STEPS
+
+
+# What is traced, and so could be computed.
+
+
+def equations(jaxpr):
+    """All equations of a jaxpr, inside loops, branches and calls too."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for inner in jax.tree_util.tree_leaves(
+            equation.params, is_leaf=lambda x: isinstance(x, JAXPRS)
+        ):
+            if isinstance(inner, JAXPRS):
+                yield from equations(getattr(inner, "jaxpr", inner))
+
+
+JAXPRS = (jex.core.Jaxpr, jex.core.ClosedJaxpr)
+
+
+def trace(hamiltonian, solver, made_jump: Any = False):
+    term = dps.HamiltonianTerm(hamiltonian)
+
+    def step(t0, t1, y):
+        carry = solver.init(term, t0, t1, y, None)
+        y, _, dense_info, carry, _ = solver.step(
+            term, t0, t1, y, None, carry, made_jump
+        )
+        return y, dense_info, carry
+
+    y = (jnp.array([1.0]), jnp.array([0.0]))
+    jaxpr = jax.make_jaxpr(step)(jnp.array(0.0), jnp.array(0.1), y)
+    return list(equations(jaxpr.jaxpr))
+
+
+def primitives(equations):
+    return {equation.primitive.name for equation in equations}
+
+
+EXPONENTIALS = {"exp", "exp2", "expm1", "log", "log1p", "pow"}
+
+
+@each()
+def test_undamped_systems_trace_no_exponential(scheme: Scheme):
+    undamped = dps.SeparableHamiltonian(dps.QuadraticKinetic(), harmonic)
+    assert not EXPONENTIALS & primitives(trace(undamped, scheme.solver))
+    # The measure sees those that are there.
+    assert EXPONENTIALS & primitives(trace(oscillator(), scheme.solver))
+
+
+@each()
+def test_steps_without_jumps_trace_no_branch(scheme: Scheme):
+    assert "cond" not in primitives(trace(oscillator(), scheme.solver))
+
+
+def test_a_jump_recomputes_what_was_carried():
+    traced = trace(oscillator(), dps.PresymplecticLeapfrog(), made_jump=jnp.array(True))
+    assert "cond" in primitives(traced)
+
+
+def test_the_size_of_a_composition_does_not_grow_with_its_stages():
+    sizes = [len(trace(oscillator(), dps.SuzukiYoshida(order))) for order in (6, 8)]
+    assert sizes[0] == sizes[1]
+
+
+@each([scheme for scheme in SCHEMES if scheme.evaluations > 5])
+def test_many_stages_run_in_one_loop(scheme: Scheme):
+    traced = trace(oscillator(), scheme.solver)
+    scans = [e for e in traced if e.primitive.name == "scan"]
+    assert len(scans) == 1
