@@ -44,6 +44,10 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         """Whether a step backwards undoes a step."""
 
     @abc.abstractmethod
+    def order(self, terms) -> int:
+        """The order of the scheme."""
+
+    @abc.abstractmethod
     def start(self, view: View, t, y: State) -> _Carry:
         """What the scheme carries from step to step besides the state, at the start."""
 
