@@ -1,0 +1,400 @@
+"""Hamiltonians are what their formulas say: derivatives, frames, vector fields."""
+
+from decimal import Decimal, localcontext
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import lineax as lx
+import numpy as np
+import pytest
+import scipy.integrate
+from helpers import assert_close, flat, henon_heiles, mixed_energy
+
+import diffrax_presym as dps
+
+
+T, Q, P = jnp.array(1.3), jnp.array([0.3, -0.7]), jnp.array([0.9, 0.4])
+MASS = jnp.array([[2.0, 0.3], [0.3, 1.0]])
+ARGS = jnp.array(1.7)
+
+
+def potential(t, q, args):
+    return args * (1 + jnp.sin(t) / 4) * henon_heiles(t, q, None)
+
+
+def kinetic(t, p, args):
+    return args * jnp.sum(p**4) / 4 + jnp.cos(t) * p[0] * p[1]
+
+
+def energy(t, q, p, args):
+    return args * (1 + jnp.sin(t) / 4) * mixed_energy(t, q, p, None)
+
+
+def canonical_kinetic(t, q, P, args):
+    return args * (1 + q[0] ** 2) * jnp.sum(P**2) / 2 + jnp.sin(t) * q[1] * P[0]
+
+
+def eta1(t):
+    return jnp.log(t + 0.5)
+
+
+LOG, CONSTANT = dps.LogDamping(3.0, shift=0.5), dps.ConstantDamping(0.7)
+QUADRATIC, RELATIVISTIC = dps.QuadraticKinetic(MASS), dps.RelativisticKinetic(1.5, 2.0)
+
+
+# Hamiltonian, and H(t, q, P) as the paper writes it.
+
+
+def quadratic(P):
+    return P @ jnp.linalg.solve(MASS, P) / 2
+
+
+def relativistic(P):
+    return 2.0 * jnp.sqrt(P @ P + 3.0**2)
+
+
+def conformal(T, eta):
+    """Equation (new_ham_time)."""
+    return lambda t, q, P: (
+        jnp.exp(eta(t)) * (T(t, jnp.exp(-eta(t)) * P) + potential(t, q, ARGS))
+    )
+
+
+def dissipative(T, eta1, eta2):
+    """Equation (gen_ham)."""
+    return lambda t, q, P: (
+        jnp.exp(-eta1(t)) * T(t, q, P) + jnp.exp(eta2(t)) * potential(t, q, ARGS)
+    )
+
+
+def log(t):
+    return 3 * jnp.log(t + 0.5)
+
+
+def constant(t):
+    return 0.7 * t
+
+
+HAMILTONIANS = {
+    "separable, quadratic T": (
+        dps.SeparableHamiltonian(QUADRATIC, potential),
+        lambda t, q, P: quadratic(P) + potential(t, q, ARGS),
+    ),
+    "separable, relativistic T": (
+        dps.SeparableHamiltonian(RELATIVISTIC, potential),
+        lambda t, q, P: relativistic(P) + potential(t, q, ARGS),
+    ),
+    "separable, any T": (
+        dps.SeparableHamiltonian(kinetic, potential),
+        lambda t, q, P: kinetic(t, P, ARGS) + potential(t, q, ARGS),
+    ),
+    "nonseparable": (
+        dps.Hamiltonian(energy),
+        lambda t, q, P: energy(t, q, P, ARGS),
+    ),
+    "conformal, undamped": (
+        dps.ConformalHamiltonian(QUADRATIC, potential),
+        lambda t, q, P: quadratic(P) + potential(t, q, ARGS),
+    ),
+    "conformal, quadratic T": (
+        dps.ConformalHamiltonian(QUADRATIC, potential, LOG),
+        conformal(lambda t, p: quadratic(p), log),
+    ),
+    "conformal, relativistic T": (
+        dps.ConformalHamiltonian(RELATIVISTIC, potential, CONSTANT),
+        conformal(lambda t, p: relativistic(p), constant),
+    ),
+    "conformal, any T": (
+        dps.ConformalHamiltonian(kinetic, potential, eta1),
+        conformal(lambda t, p: kinetic(t, p, ARGS), eta1),
+    ),
+    "conformal, nonseparable": (
+        dps.ConformalHamiltonian(energy=energy, damping=LOG),
+        lambda t, q, P: jnp.exp(log(t)) * energy(t, q, jnp.exp(-log(t)) * P, ARGS),
+    ),
+    "dissipative, quadratic T": (
+        dps.DissipativeHamiltonian(QUADRATIC, potential, eta1, LOG),
+        dissipative(lambda t, q, P: quadratic(P), eta1, log),
+    ),
+    "dissipative, relativistic T": (
+        dps.DissipativeHamiltonian(RELATIVISTIC, potential, eta1, CONSTANT),
+        dissipative(lambda t, q, P: relativistic(P), eta1, constant),
+    ),
+    "dissipative, any T": (
+        dps.DissipativeHamiltonian(kinetic, potential, LOG, CONSTANT),
+        dissipative(lambda t, q, P: kinetic(t, P, ARGS), log, constant),
+    ),
+    "dissipative, nonseparable": (
+        dps.DissipativeHamiltonian(
+            canonical_kinetic, potential, LOG, CONSTANT, separable=False
+        ),
+        dissipative(lambda t, q, P: canonical_kinetic(t, q, P, ARGS), log, constant),
+    ),
+}
+each = pytest.mark.parametrize(
+    "hamiltonian, H", HAMILTONIANS.values(), ids=HAMILTONIANS
+)
+
+
+def differences(fn, x, step=1e-5):
+    """The gradient by central differences."""
+    x = np.asarray(x)
+    units = step * np.eye(x.size)
+    return np.array([float(fn(x + e) - fn(x - e)) / (2 * step) for e in units])
+
+
+@each
+def test_velocity_and_force_are_derivatives_of_the_energy(hamiltonian, H):
+    value = jax.jit(lambda q, p: hamiltonian.energy(T, q, p, ARGS))
+    velocity = hamiltonian.velocity(T, Q, P, ARGS)
+    force = hamiltonian.force(T, Q, P, ARGS)
+    assert_close(velocity, jax.grad(value, 1)(Q, P), 1e-14)
+    assert_close(force, -jax.grad(value, 0)(Q, P), 1e-14)
+    np.testing.assert_allclose(velocity, differences(lambda p: value(Q, p), P), 1e-8)
+    np.testing.assert_allclose(force, -differences(lambda q: value(q, P), Q), 1e-8)
+
+
+@each
+def test_canonical_is_the_hamiltonian_of_the_paper(hamiltonian, H):
+    canonical = H(T, Q, hamiltonian.to_canonical(T, P))
+    assert_close(hamiltonian.canonical(T, Q, P, ARGS), canonical, 1e-14)
+    scale = jnp.exp(hamiltonian.log_scale(T))
+    assert_close(scale * hamiltonian.energy(T, Q, P, ARGS), canonical, 1e-14)
+
+
+@each
+def test_canonical_momentum_there_and_back(hamiltonian, H):
+    canonical = hamiltonian.to_canonical(T, P)
+    assert_close(canonical, jnp.exp(hamiltonian.log_scale(T)) * P, 1e-15)
+    assert_close(hamiltonian.from_canonical(T, canonical), P, 1e-15)
+
+
+@each
+def test_vector_field_is_hamilton_s_equations(hamiltonian, H):
+    canonical = hamiltonian.to_canonical(T, P)
+    dq, dP = jax.grad(H, 2)(T, Q, canonical), -jax.grad(H, 1)(T, Q, canonical)
+    # The frame moves too.
+    _, dp = jax.jvp(hamiltonian.from_canonical, (T, canonical), (jnp.ones_like(T), dP))
+    field = dps.HamiltonianTerm(hamiltonian).vf(T, (Q, P), ARGS)
+    assert_close(field, (dq, dp), 1e-13)
+
+
+def test_separability_is_known_from_the_type():
+    for name, (hamiltonian, _) in HAMILTONIANS.items():
+        assert hamiltonian.is_separable == ("nonseparable" not in name)
+
+
+def test_equal_damping_is_conformal():
+    one = dps.DissipativeHamiltonian(QUADRATIC, potential, LOG, LOG)
+    two = dps.ConformalHamiltonian(QUADRATIC, potential, LOG)
+    for name in ("energy", "canonical", "velocity", "force"):
+        first, second = (getattr(h, name)(T, Q, P, ARGS) for h in (one, two))
+        assert_close(first, second, 1e-15)
+
+
+# Derivatives by hand.
+
+
+def test_velocity_and_force_by_hand_are_used_and_equal_autodiff():
+    velocity = lambda t, p, args: args * p**3 + jnp.cos(t) * p[::-1]
+    force = lambda t, q, args: (
+        -args
+        * (1 + jnp.sin(t) / 4)
+        * (q + jnp.array([2 * q[0] * q[1], q[0] ** 2 - q[1] ** 2]))
+    )
+    expected = dps.ConformalHamiltonian(kinetic, potential, LOG)
+    by_hand = [
+        dps.ConformalHamiltonian(
+            kinetic, potential, LOG, velocity=velocity, force=force
+        ),
+        dps.VectorField(velocity, force, LOG),
+    ]
+    automatic = dps.HamiltonianTerm(expected).vf(T, (Q, P), ARGS)
+    for hamiltonian in by_hand:
+        field = dps.HamiltonianTerm(hamiltonian).vf(T, (Q, P), ARGS)
+        assert_close(field, automatic, 1e-14)
+    zero = lambda *_: 0.0
+    silent = dps.SeparableHamiltonian(kinetic, potential, velocity=zero, force=zero)
+    assert not np.any(flat(dps.HamiltonianTerm(silent).vf(T, (Q, P), ARGS)))
+
+
+def test_nonseparable_velocity_and_force_by_hand():
+    factor = lambda t, args: args * (1 + jnp.sin(t) / 4)
+    by_hand = dps.Hamiltonian(
+        energy,
+        velocity=lambda t, q, p, args: factor(t, args) * (1 + q @ q) * p,
+        force=lambda t, q, p, args: -factor(t, args) * (1 + p @ p) * q,
+    )
+    automatic = dps.Hamiltonian(energy)
+    for name in ("velocity", "force"):
+        one, two = (getattr(h, name)(T, Q, P, ARGS) for h in (by_hand, automatic))
+        assert_close(one, two, 1e-15)
+
+
+# Masses of every form.
+
+P2 = jnp.array([[0.3, -0.2, 1.0], [0.5, 0.1, -0.4]])
+TREE = {"a": P, "b": (jnp.array(0.5), P2)}
+MASSES = {
+    "none": (None, P, P),
+    "none, array of rank two": (None, P2, P2),
+    "number": (2.0, P2, P2 / 2),
+    "integer": (2, TREE, jtu.tree_map(lambda x: x / 2, TREE)),
+    "each degree of freedom": (jnp.array([2.0, 5.0]), P, P / np.array([2.0, 5.0])),
+    "each particle": (
+        jnp.array([[2.0], [5.0]]),
+        P2,
+        P2 / np.array([[2.0, 2.0, 2.0], [5.0, 5.0, 5.0]]),
+    ),
+    "each direction": (
+        jnp.array([[2.0, 3.0, 4.0]]),
+        P2,
+        P2 / np.array([[2.0, 3.0, 4.0], [2.0, 3.0, 4.0]]),
+    ),
+    "matrix": (MASS, P, np.linalg.solve(MASS, P)),
+    "operator": (
+        lx.MatrixLinearOperator(MASS, lx.positive_semidefinite_tag),
+        P,
+        np.linalg.solve(MASS, P),
+    ),
+    "pytree": (
+        {"a": MASS, "b": (4.0, jnp.array([[2.0], [5.0]]))},
+        TREE,
+        {
+            "a": jnp.linalg.solve(MASS, P),
+            "b": (jnp.array(0.125), P2 / np.array([[2.0] * 3, [5.0] * 3])),
+        },
+    ),
+}
+
+
+@pytest.mark.parametrize("mass, p, expected", MASSES.values(), ids=MASSES)
+def test_masses(mass, p, expected):
+    kinetic = dps.QuadraticKinetic(mass)
+    velocity = kinetic.velocity(T, p)
+    assert jtu.tree_structure(velocity) == jtu.tree_structure(p)
+    assert_close(velocity, jtu.tree_map(jnp.asarray, expected), 1e-15)
+    assert_close(kinetic(T, p), flat(p) @ flat(expected) / 2, 1e-15)
+    assert_close(velocity, jax.grad(kinetic, 1)(T, p), 1e-14)
+
+
+def test_the_relativistic_particle_stays_below_the_speed_of_light():
+    for size in (1.0, 1e3, 1e6):
+        speed = jnp.linalg.norm(RELATIVISTIC.velocity(T, size * P))
+        assert speed <= 2.0
+        expected = 2.0 * size / np.sqrt(size**2 + 9 / float(P @ P))
+        np.testing.assert_allclose(speed, expected, 1e-14)
+
+
+ANY = dps.SeparableHamiltonian(kinetic, potential).kinetic
+
+
+@pytest.mark.parametrize(
+    "kinetic", [QUADRATIC, RELATIVISTIC, ANY], ids=["quadratic", "relativistic", "any"]
+)
+def test_rescaled_kinetic_energies(kinetic):
+    s = jnp.array(0.8)
+    rescaled = kinetic.rescale(s)
+    assert_close(
+        rescaled(T, P, ARGS), jnp.exp(-2 * s) * kinetic(T, jnp.exp(s) * P, ARGS), 1e-14
+    )
+    assert_close(
+        rescaled.velocity(T, P, ARGS),
+        jnp.exp(-s) * kinetic.velocity(T, jnp.exp(s) * P, ARGS),
+        1e-14,
+    )
+
+
+def test_a_long_damped_frame_does_not_overflow():
+    late = jnp.array(1e4, jnp.float32)
+    q, p = Q.astype(jnp.float32), P.astype(jnp.float32)
+    args = ARGS.astype(jnp.float32)
+    for kinetic in (QUADRATIC, RELATIVISTIC):
+        system = dps.DissipativeHamiltonian(kinetic, potential, CONSTANT, CONSTANT)
+        field = dps.HamiltonianTerm(system).vf(late, (q, p), args)
+        assert np.all(np.isfinite(flat(field)))
+
+
+# Damping laws.
+
+# law, and eta(t) to fifty digits
+LAWS = {
+    "constant": (CONSTANT, lambda t: Decimal("0.7") * t),
+    "negative": (dps.ConstantDamping(-0.7), lambda t: Decimal("-0.7") * t),
+    "logarithmic": (dps.LogDamping(3.0), lambda t: 3 * t.ln()),
+    "shifted": (LOG, lambda t: 3 * (t + Decimal("0.5")).ln()),
+    "mixed": (
+        dps.MixedDamping(2.0, 0.75, 0.25),
+        lambda t: 2 * t.ln() + Decimal("0.75") * t ** Decimal("0.25"),
+    ),
+}
+laws = pytest.mark.parametrize("law, eta", LAWS.values(), ids=LAWS)
+
+
+@laws
+def test_damping_law(law, eta):
+    np.testing.assert_allclose(law(T), float(eta(Decimal(float(T)))), 1e-14)
+    rate = jax.grad(law)(T)
+    np.testing.assert_allclose(law.rate(T), rate, 1e-14)
+    h = jnp.array(1e-5)
+    np.testing.assert_allclose(law.increment(T - h, 2 * h) / (2 * h), rate, 1e-8)
+
+
+@laws
+@pytest.mark.parametrize("h", [0.25, -0.25, 2.0**-10])
+@pytest.mark.parametrize(
+    "dtype, tolerance", [(jnp.float32, 1e-6), (jnp.float64, 1e-14)]
+)
+def test_increments_are_exact_at_late_times(law, eta, h, dtype, tolerance):
+    # In `float32` a difference of two values of eta has no digit left here.
+    t, h = jnp.array(1e4, dtype), jnp.array(h, dtype)
+    increment = law.increment(t, h)
+    assert increment.dtype == dtype
+    t, h = Decimal(float(t)), Decimal(float(h))
+    with localcontext() as context:
+        context.prec = 50
+        expected = float(eta(t + h) - eta(t))
+    np.testing.assert_allclose(increment, expected, tolerance)
+
+
+@pytest.mark.parametrize("law", [law for law, _ in LAWS.values()], ids=LAWS)
+@pytest.mark.parametrize("h", [0.1, -0.1, 1e-6])
+def test_integrals_of_the_decay(law, h):
+    decay = lambda s: np.exp(-float(law.increment(T, jnp.array(s))))
+    expected, _ = scipy.integrate.quad(decay, 0, h, epsabs=0, epsrel=1e-13)
+    np.testing.assert_allclose(law.integral(T, jnp.array(h)), expected, 1e-11)
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        dps.ConstantDamping,
+        dps.LogDamping,
+        lambda gamma: dps.MixedDamping(gamma, gamma, 0.5),
+        lambda gamma: dps.MixedDamping(gamma, 0.3, gamma),
+    ],
+    ids=["constant", "logarithmic", "mixed", "mixed, power"],
+)
+def test_gradients_in_the_limit_of_no_damping(law):
+    h = jnp.array(0.1)
+
+    def values(gamma):
+        damping = law(gamma)
+        return jnp.stack(
+            [damping.increment(T, h), damping.rate(T), damping.integral(T, h)]
+        )
+
+    gradient = jax.jacrev(values)(jnp.array(0.0))
+    by_differences = (values(jnp.array(1e-5)) - values(jnp.array(-1e-5))) / 2e-5
+    np.testing.assert_allclose(gradient, by_differences, rtol=1e-8, atol=1e-9)
+
+
+def test_no_damping_is_the_limit_of_little_damping():
+    y = (Q, P)
+    field = lambda damping: dps.HamiltonianTerm(
+        dps.ConformalHamiltonian(QUADRATIC, potential, damping)
+    ).vf(T, y, ARGS)
+    for law in (dps.ConstantDamping, dps.LogDamping):
+        assert_close(field(law(0.0)), field(None), 1e-16)
+        assert_close(field(law(1e-10)), field(None), 1e-9)
