@@ -87,7 +87,8 @@ def compare(solve, loop, q, p, steps, repeats):
         jax.block_until_ready(fn(q, p, steps))
         return (time.perf_counter() - start) / steps
 
-    timed(solve), timed(loop)
+    for fn in (solve, loop):
+        timed(fn)
     pairs = [(timed(solve), timed(loop)) for _ in range(repeats)]
     medians = [statistics.median(side) for side in zip(*pairs, strict=True)]
     return *medians, statistics.median(a / b for a, b in pairs)

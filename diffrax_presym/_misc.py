@@ -1,18 +1,9 @@
-from typing import TYPE_CHECKING
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
-
-
-if TYPE_CHECKING:
-    # To a type checker an abstract field is any kind of field.
-    from typing import ClassVar as AbstractVar
-else:
-    from equinox import AbstractVar as AbstractVar
 
 
 def as_parameter(x, name: str) -> Inexact[Array, "..."]:

@@ -135,7 +135,8 @@ def slope(hs, errors, floor):
     fit = [(h, e) for h, e in zip(hs, errors, strict=True) if floor < e < 1][-3:]
     if len(fit) < 2:
         return float("nan")
-    return np.polyfit(*np.log(fit).T, 1)[0]
+    log_hs, log_errors = np.log(fit).T
+    return np.polyfit(log_hs, log_errors, 1)[0]
 
 
 def convergence(hs):
@@ -258,7 +259,8 @@ def basins(n):
         y0=(q0, p0),
         progress_meter=dfx.TqdmProgressMeter(),
     )
-    return np.asarray(sol.ys[0][-1])
+    q, _ = jax.tree.map(lambda y: np.asarray(y[-1]), sol.ys)
+    return q
 
 
 def picture(path, hs, errors, curves, wells):

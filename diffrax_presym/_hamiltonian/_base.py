@@ -1,11 +1,19 @@
 import abc
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact, PyTree
 
-from .._misc import AbstractVar, tree_scale
+from .._misc import tree_scale
 from ._damping import AbstractDamping, Scalar, Time
+
+
+if TYPE_CHECKING:
+    # To a type checker an abstract field is any kind of field.
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 Q = PyTree[Inexact[Array, "..."]]

@@ -1,9 +1,11 @@
+from typing import TYPE_CHECKING
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from .._misc import AbstractVar, scalar_fn, tree_scale
+from .._misc import scalar_fn, tree_scale
 from ._base import AbstractHamiltonian, P, Q
 from ._damping import AbstractDamping, as_damping, Scalar, Time
 from ._energy import Hamiltonian, SeparableHamiltonian
@@ -13,6 +15,13 @@ from ._kinetic import (
     CallableKinetic,
     integrate_velocity,
 )
+
+
+if TYPE_CHECKING:
+    # To a type checker an abstract field is any kind of field.
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 class _AbstractDamped(AbstractHamiltonian):

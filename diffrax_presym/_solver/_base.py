@@ -5,7 +5,7 @@ and nothing else. A drift moves `q` and takes time, and so the frame of `p`, alo
 """
 
 import abc
-from typing import ClassVar, Generic, Literal, TypeVar
+from typing import ClassVar, Generic, Literal, TYPE_CHECKING, TypeVar
 
 import diffrax as dfx
 import equinox as eqx
@@ -17,8 +17,15 @@ import optimistix as optx
 from jaxtyping import Array, PyTree
 
 from .._interpolation import HermiteInterpolation
-from .._misc import AbstractVar, cast_to, tree_add, tree_scale
+from .._misc import cast_to, tree_add, tree_scale
 from .._term import check_state, State, View, view
+
+
+if TYPE_CHECKING:
+    # To a type checker an abstract field is any kind of field.
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 _Carry = TypeVar("_Carry")

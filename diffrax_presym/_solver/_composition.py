@@ -1,6 +1,6 @@
 import math
 from decimal import Decimal, localcontext
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TYPE_CHECKING
 
 import diffrax as dfx
 import equinox as eqx
@@ -10,7 +10,6 @@ import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import PyTree
 
-from .._misc import AbstractVar
 from .._term import State, View
 from ._base import AbstractPresymplecticSolver, Clock, stage_table
 from ._leapfrog import PresymplecticLeapfrog
@@ -22,6 +21,13 @@ from ._tableaus import (
     SUZUKI_4,
 )
 from ._tao import PresymplecticTao
+
+
+if TYPE_CHECKING:
+    # To a type checker an abstract field is any kind of field.
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 Weights = tuple[float, ...]

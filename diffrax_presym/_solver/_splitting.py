@@ -1,12 +1,12 @@
 import math
-from typing import ClassVar
+from typing import ClassVar, TYPE_CHECKING
 
 import equinox as eqx
 import jax.lax as lax
 import numpy as np
 from jaxtyping import PyTree
 
-from .._misc import AbstractVar, cast_to, tree_add
+from .._misc import cast_to, tree_add
 from .._term import State, View
 from ._base import AbstractPresymplecticSolver, Clock, stage_table
 from ._tableaus import (
@@ -17,6 +17,13 @@ from ._tableaus import (
     BLANES_MOAN_RKN_6,
     SplittingTableau,
 )
+
+
+if TYPE_CHECKING:
+    # To a type checker an abstract field is any kind of field.
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
