@@ -43,15 +43,18 @@ class Entangled(eqx.Module):
         return kinetic + self.potential(t, q, args)
 
 
-MASS, GAMMA = jnp.array(1.3), jnp.array(0.4)
+# Python numbers make arrays of weak type, and each leaf that then changes its type in a
+# step of a difference a compilation of its own.
+MASS, GAMMA, SHIFT, STIFFNESS = map(np.float64, (1.3, 0.4, 1.0, 0.8))
 SEPARABLE = dps.ConformalHamiltonian(
     dps.QuadraticKinetic(MASS), Learned(), dps.ConstantDamping(GAMMA)
 )
 NONSEPARABLE = dps.ConformalHamiltonian(
-    energy=Entangled(MASS, Learned()), damping=dps.LogDamping(GAMMA, shift=1.0)
+    energy=Entangled(jnp.asarray(MASS), Learned()),
+    damping=dps.LogDamping(GAMMA, shift=SHIFT),
 )
 Y0 = (jnp.array([0.5, -0.3]), jnp.array([0.2, 0.4]))
-ARGS = {"stiffness": jnp.array(0.8)}
+ARGS = {"stiffness": jnp.asarray(STIFFNESS)}
 
 
 def loss(inputs, solver, adjoint, saveat=None):
@@ -167,7 +170,7 @@ def test_gradients_without_damping(law):
     hamiltonian = dps.ConformalHamiltonian(
         dps.QuadraticKinetic(MASS),
         Learned(),
-        law(0.0) if law is dps.ConstantDamping else law(0.0, shift=1.0),
+        law(0 * GAMMA) if law is dps.ConstantDamping else law(0 * GAMMA, shift=SHIFT),
     )
     # The shift of time has no effect then.
     vanishing = 1 if law is dps.LogDamping else 0
