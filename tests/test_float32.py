@@ -70,26 +70,28 @@ def soft_kinetic(t, p, args):
     return jnp.sum(jnp.sqrt(1 + p**2))
 
 
-DAMPING = dps.LogDamping(3.0, shift=1.0)
+# Not Python numbers, whose weak type would give way by itself.
+HALF, ONE, TWO, THREE = map(np.float64, (0.5, 1.0, 2.0, 3.0))
+DAMPING = dps.LogDamping(THREE, shift=ONE)
 SYSTEMS = {
-    "undamped": dps.SeparableHamiltonian(dps.QuadraticKinetic(2.0), harmonic),
+    "undamped": dps.SeparableHamiltonian(dps.QuadraticKinetic(TWO), harmonic),
     "constant": dps.ConformalHamiltonian(
-        dps.QuadraticKinetic(jnp.array([1.0, 2.0])), harmonic, dps.ConstantDamping(0.5)
+        dps.QuadraticKinetic(jnp.array([1.0, 2.0])), harmonic, dps.ConstantDamping(HALF)
     ),
     "matrix": dps.ConformalHamiltonian(
         dps.QuadraticKinetic(jnp.diag(jnp.array([1.0, 2.0]))), harmonic, DAMPING
     ),
     "mixed": dps.ConformalHamiltonian(
-        dps.QuadraticKinetic(2.0), harmonic, dps.MixedDamping(1.0, 1.0, 0.5)
+        dps.QuadraticKinetic(TWO), harmonic, dps.MixedDamping(ONE, ONE, HALF)
     ),
     "callable": dps.ConformalHamiltonian(
-        dps.QuadraticKinetic(2.0), harmonic, lambda t: jnp.sin(t)
+        dps.QuadraticKinetic(TWO), harmonic, lambda t: jnp.sin(t)
     ),
     "unequal": dps.DissipativeHamiltonian(
-        dps.QuadraticKinetic(2.0), harmonic, DAMPING, dps.ConstantDamping(0.5)
+        dps.QuadraticKinetic(TWO), harmonic, DAMPING, dps.ConstantDamping(HALF)
     ),
     "relativistic": dps.ConformalHamiltonian(
-        dps.RelativisticKinetic(1.0, 2.0), harmonic, DAMPING
+        dps.RelativisticKinetic(ONE, TWO), harmonic, DAMPING
     ),
     "any T": dps.ConformalHamiltonian(soft_kinetic, harmonic, DAMPING),
     "by hand": dps.VectorField(lambda t, p, args: p, lambda t, q, args: -q, DAMPING),
@@ -161,12 +163,12 @@ MIXED = {
     "double": jnp.array([[1.0], [2.0]], jnp.float64),
 }
 MIXED_SYSTEMS = {
-    "undamped": dps.SeparableHamiltonian(dps.QuadraticKinetic(2.0), cosine),
+    "undamped": dps.SeparableHamiltonian(dps.QuadraticKinetic(TWO), cosine),
     "constant": dps.ConformalHamiltonian(
-        dps.QuadraticKinetic(2.0), cosine, dps.ConstantDamping(0.5)
+        dps.QuadraticKinetic(TWO), cosine, dps.ConstantDamping(HALF)
     ),
     "unequal": dps.DissipativeHamiltonian(
-        dps.QuadraticKinetic(2.0), cosine, DAMPING, dps.ConstantDamping(0.5)
+        dps.QuadraticKinetic(TWO), cosine, DAMPING, dps.ConstantDamping(HALF)
     ),
 }
 
