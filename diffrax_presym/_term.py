@@ -99,9 +99,9 @@ class View(eqx.Module):
         """`p` from the frame of `t` to the frame of `t + h`."""
         return move_frame(self.hamiltonian.damping, t, h, p)
 
-    def drift(self, t, h, y: State) -> State:
-        """The exact flow of the kinetic part, frame included."""
-        return self.hamiltonian.drift(t, h, *y, self.args)
+    def drift(self, t, h, y: State, order: int) -> State:
+        """The flow of the kinetic part, frame included."""
+        return self.hamiltonian.drift(t, h, *y, self.args, order)
 
     def slope(self, t, y: State, force=None) -> State:
         """The full vector field, of which the force may be known already."""

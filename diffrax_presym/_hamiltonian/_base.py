@@ -62,8 +62,13 @@ class AbstractHamiltonian(eqx.Module):
         """Whether that part is known to be a kinetic energy quadratic in `p`."""
 
     @abc.abstractmethod
-    def drift(self, t: Time, h: Time, q: Q, p: P, args: PyTree = None) -> tuple[Q, P]:
-        """The exact flow of the kinetic part from `t` to `t + h`, frame included."""
+    def drift(
+        self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8
+    ) -> tuple[Q, P]:
+        """The flow of the kinetic part from `t` to `t + h`, frame included.
+
+        Exact where it is known in closed form, and else to the given order in `h`.
+        """
 
     def log_scale(self, t: Time) -> Scalar:
         r"""The log scale $\eta(t)$; 0 for a system without damping."""

@@ -41,10 +41,11 @@ class AbstractDamping(eqx.Module):
         r"""The rate of damping $\eta'(t)$."""
 
     @abc.abstractmethod
-    def integral(self, t: Time, h: Time) -> Scalar:
+    def integral(self, t: Time, h: Time, order: int) -> Scalar:
         r"""The integral of $e^{\eta(t) - \eta(s)}$ over $s$ from $t$ to $t + h$.
 
         How far a velocity that is one at $t$, and decays with the frame, carries.
+        Exact where the law allows, and otherwise to the given order in `h`.
         """
 
 
@@ -74,7 +75,7 @@ class ConstantDamping(AbstractDamping):
     def rate(self, t: Time) -> Scalar:
         return cast_to(self.gamma, t)
 
-    def integral(self, t: Time, h: Time) -> Scalar:
+    def integral(self, t: Time, h: Time, order: int) -> Scalar:
         return h * _expm1_ratio(-self.increment(t, h))
 
 
@@ -113,7 +114,7 @@ class LogDamping(AbstractDamping):
     def rate(self, t: Time) -> Scalar:
         return cast_to(self.gamma, t) / (t + cast_to(self.shift, t))
 
-    def integral(self, t: Time, h: Time) -> Scalar:
+    def integral(self, t: Time, h: Time, order: int) -> Scalar:
         # With x = log((s + h) / s) it is s (exp((1 - gamma) x) - 1) / (1 - gamma).
         since = t + cast_to(self.shift, t)
         growth = jnp.log1p(h / since)
@@ -159,8 +160,8 @@ class MixedDamping(AbstractDamping):
         gamma1, gamma2, delta = self._parameters(t)
         return gamma1 / t + gamma2 * delta * t ** (delta - 1)
 
-    def integral(self, t: Time, h: Time) -> Scalar:
-        return quadrature(lambda s: jnp.exp(-self.increment(t, s)), h)
+    def integral(self, t: Time, h: Time, order: int) -> Scalar:
+        return quadrature(lambda s: jnp.exp(-self.increment(t, s)), h, order)
 
 
 class CallableDamping(AbstractDamping):
@@ -178,8 +179,8 @@ class CallableDamping(AbstractDamping):
         t = jnp.asarray(t)
         return jax.jvp(self, (t,), (jnp.ones_like(t),))[1]
 
-    def integral(self, t: Time, h: Time) -> Scalar:
-        return quadrature(lambda s: jnp.exp(-self.increment(t, s)), h)
+    def integral(self, t: Time, h: Time, order: int) -> Scalar:
+        return quadrature(lambda s: jnp.exp(-self.increment(t, s)), h, order)
 
 
 def move_frame(damping: AbstractDamping | None, t: Time, h: Time, p: PyTree) -> PyTree:
@@ -198,16 +199,16 @@ def move_frame(damping: AbstractDamping | None, t: Time, h: Time, p: PyTree) -> 
     return tree_add(p, jnp.expm1(-increment), p)
 
 
-# Gauss-Legendre with four nodes integrates with an error of order nine in the length:
-# enough for schemes of order eight.
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
-_NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
+def quadrature(fn: Callable, h: Time, order: int) -> PyTree:
+    """The integral of a function of time, a pytree, from 0 to `h`.
 
-
-def quadrature(fn: Callable, h: Time) -> PyTree:
-    """The integral of a function of time, a pytree, from 0 to `h`."""
-    nodes = zip(_NODES.tolist(), _WEIGHTS.tolist(), strict=True)
-    terms = [tree_scale(weight * h, fn(node * h)) for node, weight in nodes]
+    By Gauss and Legendre, of at least the given order.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss((order + 1) // 2)
+    terms = [
+        tree_scale(weight / 2 * h, fn((1 + node) / 2 * h))
+        for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True)
+    ]
     return jtu.tree_map(lambda *x: sum(x[1:], x[0]), *terms)
 
 

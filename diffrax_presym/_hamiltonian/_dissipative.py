@@ -50,8 +50,10 @@ class _AbstractDamped(AbstractHamiltonian):
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         return self.undamped.force(t, q, p, args)
 
-    def drift(self, t: Time, h: Time, q: Q, p: P, args: PyTree = None) -> tuple[Q, P]:
-        return self.undamped.damped_drift(t, h, q, p, args, self.damping)
+    def drift(
+        self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8
+    ) -> tuple[Q, P]:
+        return self.undamped.damped_drift(t, h, q, p, args, order, self.damping)
 
 
 class ConformalHamiltonian(_AbstractDamped):
@@ -184,12 +186,12 @@ class _ScaledKinetic(AbstractKinetic):
         scale, kinetic = self._parts(t)
         return tree_scale(scale, kinetic.velocity(t, p, args))
 
-    def displacement(self, t, h, p, args, damping):
+    def displacement(self, t, h, p, args, damping, order):
         if not self.is_quadratic:
-            return integrate_velocity(self.velocity, t, h, p, args, damping)
+            return integrate_velocity(self.velocity, t, h, p, args, damping, order)
         # The decay of exp(eta2 - eta1) and that of the frame, eta2, leave that of eta1.
         scale, kinetic = self._parts(t)
-        dq = kinetic.displacement(t, h, p, args, self.eta1)
+        dq = kinetic.displacement(t, h, p, args, self.eta1, order)
         return tree_scale(scale, dq)
 
     def rescale(self, s):

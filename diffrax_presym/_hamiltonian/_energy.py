@@ -84,16 +84,18 @@ class SeparableHamiltonian(AbstractHamiltonian):
             return jtu.tree_map(jnp.negative, slope(t, q, args))
         return match(self.force_fn(t, q, args), q, "`force`", "`q`")
 
-    def drift(self, t: Time, h: Time, q: Q, p: P, args: PyTree = None) -> tuple[Q, P]:
-        return self.damped_drift(t, h, q, p, args, None)
+    def drift(
+        self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8
+    ) -> tuple[Q, P]:
+        return self.damped_drift(t, h, q, p, args, order, None)
 
-    def damped_drift(self, t, h, q, p, args, damping):
+    def damped_drift(self, t, h, q, p, args, order, damping):
         """The drift of the same energy in a moving frame."""
         if self.velocity_fn is None:
-            dq = self.kinetic.displacement(t, h, p, args, damping)
+            dq = self.kinetic.displacement(t, h, p, args, damping, order)
         else:
             velocity = lambda t, p, args: self.velocity(t, q, p, args)
-            dq = integrate_velocity(velocity, t, h, p, args, damping)
+            dq = integrate_velocity(velocity, t, h, p, args, damping, order)
         return tree_add(q, 1, dq), move_frame(damping, t, h, p)
 
 
@@ -158,10 +160,12 @@ class Hamiltonian(AbstractHamiltonian):
             return jtu.tree_map(jnp.negative, slope)
         return match(self.force_fn(t, q, p, args), q, "`force`", "`q`")
 
-    def drift(self, t: Time, h: Time, q: Q, p: P, args: PyTree = None) -> tuple[Q, P]:
-        return self.damped_drift(t, h, q, p, args, None)
+    def drift(
+        self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8
+    ) -> tuple[Q, P]:
+        return self.damped_drift(t, h, q, p, args, order, None)
 
-    def damped_drift(self, t, h, q, p, args, damping):
+    def damped_drift(self, t, h, q, p, args, order, damping):
         raise ValueError(
             "`Hamiltonian(energy)` has no exact drift, because it is not split into a "
             "kinetic and a potential part. Write `SeparableHamiltonian(kinetic, "

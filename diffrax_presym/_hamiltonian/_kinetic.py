@@ -9,7 +9,7 @@ import lineax as lx
 from jaxtyping import Array, Inexact, PyTree
 
 from .._misc import as_parameter, as_positive, cast_to, scalar_fn, tree_dot, tree_scale
-from ._damping import AbstractDamping, move_frame, quadrature, Scalar, Time
+from ._damping import AbstractDamping, quadrature, Scalar, Time
 
 
 class AbstractKinetic(eqx.Module):
@@ -36,9 +36,10 @@ class AbstractKinetic(eqx.Module):
         p: PyTree,
         args: PyTree,
         damping: AbstractDamping | None,
+        order: int,
     ) -> PyTree:
         """The integral of the velocity from `t` to `t + h`, while `p` is constant but
-        for its frame."""
+        for its frame. Exact where it can be, and else to the given order in `h`."""
 
     @abc.abstractmethod
     def rescale(self, s: Scalar) -> "AbstractKinetic":
@@ -98,8 +99,8 @@ class QuadraticKinetic(AbstractKinetic):
             )
         return jtu.tree_map(_divide, p, mass)
 
-    def displacement(self, t, h, p, args, damping):
-        length = h if damping is None else damping.integral(t, h)
+    def displacement(self, t, h, p, args, damping, order):
+        length = h if damping is None else damping.integral(t, h, order)
         return tree_scale(length, self.velocity(t, p, args))
 
     def rescale(self, s: Scalar) -> "QuadraticKinetic":
@@ -172,10 +173,10 @@ class RelativisticKinetic(AbstractKinetic):
         norm = self._norm(p)
         return tree_scale(cast_to(self.speed, norm) / norm, p)
 
-    def displacement(self, t, h, p, args, damping):
+    def displacement(self, t, h, p, args, damping, order):
         if damping is None:
             return tree_scale(h, self.velocity(t, p, args))
-        return integrate_velocity(self.velocity, t, h, p, args, damping)
+        return integrate_velocity(self.velocity, t, h, p, args, damping, order)
 
     def rescale(self, s: Scalar) -> "RelativisticKinetic":
         speed = self.speed * cast_to(jnp.exp(-s), self.speed)
@@ -198,8 +199,8 @@ class CallableKinetic(AbstractKinetic):
     def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
         return jax.grad(scalar_fn(self.fn, "The kinetic energy"), argnums=1)(t, p, args)
 
-    def displacement(self, t, h, p, args, damping):
-        return integrate_velocity(self.velocity, t, h, p, args, damping)
+    def displacement(self, t, h, p, args, damping, order):
+        return integrate_velocity(self.velocity, t, h, p, args, damping, order)
 
     def rescale(self, s: Scalar) -> "CallableKinetic":
         def rescaled(t, p, args):
@@ -209,10 +210,14 @@ class CallableKinetic(AbstractKinetic):
         return CallableKinetic(rescaled)
 
 
-def integrate_velocity(velocity: Callable, t, h, p, args, damping) -> PyTree:
+def integrate_velocity(velocity, t, h, p, args, damping, order) -> PyTree:
     """The displacement by any velocity `velocity(t, p, args)`, by quadrature."""
-    moving = lambda s: velocity(t + s, move_frame(damping, t, s, p), args)
-    return quadrature(moving, h)
+
+    def moving(s):
+        decay = None if damping is None else jnp.exp(-damping.increment(t, s))
+        return velocity(t + s, tree_scale(decay, p), args)
+
+    return quadrature(moving, h, order)
 
 
 def as_kinetic(kinetic) -> AbstractKinetic:

@@ -68,7 +68,9 @@ class VectorField(AbstractHamiltonian):
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         return match(self.force_fn(t, q, args), q, "`force`", "`q`")
 
-    def drift(self, t: Time, h: Time, q: Q, p: P, args: PyTree = None) -> tuple[Q, P]:
+    def drift(
+        self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8
+    ) -> tuple[Q, P]:
         velocity = lambda t, p, args: self.velocity(t, q, p, args)
-        dq = integrate_velocity(velocity, t, h, p, args, self.damping)
+        dq = integrate_velocity(velocity, t, h, p, args, self.damping, order)
         return tree_add(q, 1, dq), move_frame(self.damping, t, h, p)

@@ -51,12 +51,12 @@ class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
             y = kick(y, fractions[0] * h, carry)
             fractions = fractions[1:]
         drifts, kicks = fractions[0::2], fractions[1::2]
-        clock = Clock(t0, t1, h)
+        clock, order = Clock(t0, t1, h), self.tableau.order
 
         def stage(state, moves):
             start, end, drift, impulse = moves
             y, _ = state
-            y = view.drift(clock(start), drift * h, y)
+            y = view.drift(clock(start), drift * h, y, order)
             force = view.force(clock(end), y)
             return (kick(y, impulse * h, force), force if kick_first else None), None
 
@@ -65,7 +65,7 @@ class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
         (y, carry), _ = lax.scan(stage, (y, carry), paired)
         if not kick_first:
             start, _, drift = (x[-1] for x in table)
-            y = view.drift(clock(start), drift * h, y)
+            y = view.drift(clock(start), drift * h, y, order)
         return y, carry, None
 
     def slope(self, view: View, t, y: State, carry: PyTree) -> State:
