@@ -1,0 +1,234 @@
+"""The tabulated schemes: their coefficients, order, structure and cost."""
+
+import functools
+import json
+import math
+import pathlib
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, flat, solve
+
+import diffrax_presym as dps
+
+
+TABLES = json.loads(pathlib.Path(__file__).with_name("tableaus.json").read_text())
+SPLITTINGS = {
+    name: getattr(dps, name)() for name in TABLES if name.startswith("Blanes")
+}
+COMPOSITIONS = {
+    "Suzuki4": dps.Suzuki4(),
+    "SofroniouSpaletta6": dps.SofroniouSpaletta6(),
+    "SofroniouSpaletta8": dps.SofroniouSpaletta8(),
+    "SofroniouSpaletta10": dps.SofroniouSpaletta10(),
+    "SuzukiYoshida4": dps.SuzukiYoshida(4),
+    "SuzukiYoshida6": dps.SuzukiYoshida(6),
+    "SuzukiYoshida8": dps.SuzukiYoshida(8),
+}
+SCHEMES = SPLITTINGS | COMPOSITIONS
+# The paper's own triple jumps are tested with the other schemes of the paper.
+NEW = [name for name in SCHEMES if not name.startswith("SuzukiYoshida")]
+
+
+@pytest.mark.parametrize("name", SPLITTINGS)
+def test_splittings_agree_with_the_tables_to_the_last_digit(name):
+    tableau, table = SPLITTINGS[name].tableau, TABLES[name]
+    assert tableau.fractions == tuple(float(x) for x in table["coefficients"])
+    assert tableau.order == table["order"]
+    assert tableau.kick_first == (table["moves"][0] == "K")
+    for turn in (0, 1):
+        assert abs(math.fsum(tableau.fractions[turn::2]) - 1) < 1e-15
+
+
+@pytest.mark.parametrize("name", COMPOSITIONS)
+def test_compositions_agree_with_the_tables_to_the_last_digit(name):
+    solver, table = COMPOSITIONS[name], TABLES[name]
+    assert solver.weights == tuple(float(x) for x in table["coefficients"])
+    assert solver.order(None) == table["order"]
+    assert abs(math.fsum(solver.weights) - 1) < 1e-15
+
+
+@pytest.mark.parametrize("name", NEW)
+def test_coefficients_are_symmetric_and_so_are_the_schemes(name):
+    table = TABLES[name]["coefficients"]
+    assert table == table[::-1]
+    assert SCHEMES[name].is_symmetric
+
+
+# Two nonlinear systems in which everything depends on time.
+
+
+def pendulum_on_a_moving_pivot(t, q, args):
+    return -jnp.sum(jnp.cos(q)) * (1 + 0.3 * jnp.sin(t))
+
+
+def driven_double_well(t, q, args):
+    return jnp.sum(q**4 / 4 - q**2 / 2 - 0.3 * q * jnp.cos(1.2 * t))
+
+
+SYSTEMS = {
+    "pendulum": dps.DissipativeHamiltonian(
+        dps.QuadraticKinetic(2.0),
+        pendulum_on_a_moving_pivot,
+        eta1=dps.ConstantDamping(0.1),
+        eta2=dps.LogDamping(1.0, shift=1.0),
+    ),
+    "double well": dps.ConformalHamiltonian(
+        dps.QuadraticKinetic(), driven_double_well, dps.MixedDamping(0.3, 0.1, 0.5)
+    ),
+}
+Y0 = (jnp.array([1.0, 0.5]), jnp.array([0.3, -0.7]))
+T0, T1 = 1.0, 5.0
+
+
+@functools.cache
+def exact(system):
+    sol = solve(SYSTEMS[system], dfx.Dopri8(), T0, T1, 1e-3, Y0)
+    return np.asarray(flat(sol.ys))
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize("name", NEW)
+def test_order_on_nonlinear_systems_that_depend_on_time(name, system):
+    solver = SCHEMES[name]
+    steps = np.array([4, 6, 8, 12, 16, 24, 32, 48, 64])
+    errors = []
+    for n in steps:
+        ys = flat(solve(SYSTEMS[system], solver, T0, T1, (T1 - T0) / n, Y0).ys)
+        errors.append(np.max(np.abs(np.asarray(ys) - exact(system))))
+    # Off the rounding plateau. Above its claim, a scheme is not there yet, not wrong.
+    fine = np.flatnonzero(np.array(errors) > 1e-12)[-3:]
+    slope, _ = np.polyfit(np.log(1 / steps[fine]), np.log(np.array(errors)[fine]), 1)
+    assert slope > solver.order(None) - 0.15
+
+
+def relativistic(t, q, args):
+    return jnp.sum(q**4) / 4
+
+
+@pytest.mark.parametrize("name", ["BlanesMoan4", "BlanesMoan6"])
+@pytest.mark.parametrize("damping", ["constant", "none"])
+def test_order_for_kinetic_energies_that_are_not_quadratic(name, damping):
+    eta = dps.ConstantDamping(0.3) if damping == "constant" else None
+    system = dps.ConformalHamiltonian(dps.RelativisticKinetic(), relativistic, eta)
+    expected = np.asarray(flat(solve(system, dfx.Dopri8(), 0.0, 4.0, 1e-3, Y0).ys))
+    errors = []
+    for h in (0.125, 0.0625):
+        ys = flat(solve(system, SPLITTINGS[name], 0.0, 4.0, h, Y0).ys)
+        errors.append(np.max(np.abs(np.asarray(ys) - expected)))
+    order = math.log2(errors[0] / errors[1])
+    assert abs(order - SPLITTINGS[name].order(None)) < 0.2
+
+
+@eqx.filter_jit
+def one_step(system, solver, y, t0, t1):
+    term = dps.HamiltonianTerm(system)
+    carry = solver.init(term, t0, t1, y, None)
+    return solver.step(term, t0, t1, y, None, carry, made_jump=False)[0]
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize("name", NEW)
+def test_a_step_contracts_the_form_by_the_damping(name, system):
+    t0, t1 = jnp.array(1.0), jnp.array(1.2)
+    hamiltonian, solver = SYSTEMS[system], SCHEMES[name]
+
+    def step(x):
+        return flat(one_step(hamiltonian, solver, (x[:2], x[2:]), t0, t1))
+
+    jacobian = jax.jacfwd(step)(flat(Y0))
+    omega = np.kron([[0, -1], [1, 0]], np.eye(2))
+    contraction = np.exp(-hamiltonian.damping.increment(t0, t1 - t0))
+    assert np.max(np.abs(jacobian.T @ omega @ jacobian - contraction * omega)) < 1e-13
+
+
+@pytest.mark.parametrize("name", NEW)
+def test_a_step_backwards_undoes_a_step(name):
+    system, solver = SYSTEMS["double well"], SCHEMES[name]
+    t0, t1 = jnp.array(1.0), jnp.array(1.3)
+    there = one_step(system, solver, Y0, t0, t1)
+    assert_close(one_step(system, solver, there, t1, t0), Y0, 1e-14)
+
+
+@pytest.mark.parametrize("name", SPLITTINGS)
+def test_one_evaluation_of_the_force_for_each_kick(name):
+    calls = 0
+
+    def count(q):
+        nonlocal calls
+        calls += 1
+        return np.asarray(-q)
+
+    # Differentiated, but not evaluated, for the dense output of high order.
+    @jax.custom_jvp
+    def force(q):
+        return jax.pure_callback(count, jax.ShapeDtypeStruct(q.shape, q.dtype), q)
+
+    force.defjvp(lambda q, dq: (force(*q), -dq[0]))
+    system = dps.SeparableHamiltonian(
+        dps.QuadraticKinetic(),
+        lambda t, q, args: jnp.sum(q**2) / 2,
+        force=lambda t, q, args: force(q),
+    )
+    steps = 8
+    sol = solve(system, SPLITTINGS[name], 0.0, 1.0, 1 / steps, Y0)
+    jax.block_until_ready(sol.ys)
+    tableau = SPLITTINGS[name].tableau
+    kicks = len(tableau.fractions[0 if tableau.kick_first else 1 :: 2])
+    # A kick that ends one step and starts the next is evaluated once.
+    per_step = kicks - tableau.kick_first
+    assert calls == per_step * steps + tableau.kick_first
+
+
+@pytest.mark.parametrize("gamma", [0.0, 1e-9, 1e-3, 0.7, 1.0, 1.0 + 1e-9, 3.0, -0.5])
+@pytest.mark.parametrize("law", [dps.ConstantDamping, lambda g: dps.LogDamping(g, 1.0)])
+def test_the_exact_drift_is_the_integral_of_the_velocity(gamma, law):
+    t, h = jnp.array(2.0), jnp.array(0.3)
+    damping = law(gamma)
+    nodes, weights = np.polynomial.legendre.leggauss(20)
+    s = (nodes + 1) / 2 * h
+    decay = jnp.exp(-jax.vmap(lambda s: damping.increment(t, s))(s))
+    expected = jnp.sum(weights / 2 * h * decay)
+    assert abs(damping.integral(t, h, order=4) - expected) < 2e-16 * 4
+
+
+@pytest.mark.parametrize("gamma", [0.0, 1e-12, 0.0666, 0.0667, 1.0])
+@pytest.mark.parametrize("law", [dps.ConstantDamping, dps.LogDamping])
+def test_the_exact_drift_is_smooth_in_the_damping(gamma, law):
+    t, h = jnp.array(2.0), jnp.array(0.3)
+    length = lambda gamma: law(gamma).integral(t, h, order=4)
+    e = 1e-5
+    slope = (length(gamma + e) - length(gamma - e)) / (2 * e)
+    assert abs(jax.grad(length)(gamma) - slope) < 1e-10
+    assert jnp.isfinite(jax.grad(jax.grad(length))(gamma))
+
+
+def test_a_splitting_of_your_own():
+    # Strang's splitting, exact drift first: the midpoint of the harmonic oscillator.
+    strang = dps.SplittingTableau(
+        order=2, kick_first=False, quadratic=False, fractions=(0.5, 1.0, 0.5)
+    )
+    system = dps.SeparableHamiltonian(
+        dps.QuadraticKinetic(), lambda t, q, args: jnp.sum(q**2) / 2
+    )
+    h = 0.25
+    q, p = (
+        jnp.squeeze(x, 0) for x in solve(system, dps.Splitting(strang), 0, h, h, Y0).ys
+    )
+    middle = Y0[0] + h / 2 * Y0[1]
+    kicked = Y0[1] - h * middle
+    assert_close(ys, (middle + h / 2 * kicked, kicked), 1e-15)
+
+
+def test_splittings_that_do_not_add_up_are_refused():
+    make = lambda *fractions: dps.Splitting(
+        dps.SplittingTableau(2, kick_first=True, quadratic=False, fractions=fractions)
+    )
+    with pytest.raises(ValueError, match="sum to one"):
+        make(0.5, 0.9, 0.5)
+    with pytest.raises(ValueError, match="odd number of moves"):
+        make(1.0, 1.0)
