@@ -101,7 +101,7 @@ def test_order_on_nonlinear_systems_that_depend_on_time(name, system):
         ys = flat(solve(SYSTEMS[system], solver, T0, T1, (T1 - T0) / n, Y0).ys)
         errors.append(np.max(np.abs(np.asarray(ys) - exact(system))))
     # Off the rounding plateau. Above its claim, a scheme is not there yet, not wrong.
-    fine = np.flatnonzero(np.array(errors) > 1e-12)[-3:]
+    fine = np.flatnonzero(np.array(errors) > 1e-13)[-3:]
     slope, _ = np.polyfit(np.log(1 / steps[fine]), np.log(np.array(errors)[fine]), 1)
     assert slope > solver.order(None) - 0.15
 
@@ -216,9 +216,8 @@ def test_a_splitting_of_your_own():
         dps.QuadraticKinetic(), lambda t, q, args: jnp.sum(q**2) / 2
     )
     h = 0.25
-    q, p = (
-        jnp.squeeze(x, 0) for x in solve(system, dps.Splitting(strang), 0, h, h, Y0).ys
-    )
+    sol = solve(system, dps.Splitting(strang), 0.0, h, h, Y0)
+    ys = jax.tree.map(lambda y: y[0], sol.ys)
     middle = Y0[0] + h / 2 * Y0[1]
     kicked = Y0[1] - h * middle
     assert_close(ys, (middle + h / 2 * kicked, kicked), 1e-15)
