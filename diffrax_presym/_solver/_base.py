@@ -72,8 +72,8 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         """The full vector field at an end of a step, for dense output."""
 
     def init(self, terms, t0, t1, y0, args) -> _Carry:
-        check_state(y0)
         system = view(terms, args)
+        check_state(y0)
         return self.start(system, system.time(t0), y0)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
@@ -181,7 +181,7 @@ class AbstractKickDriftSolver(AbstractPresymplecticSolver[_Carry]):
             return fn(guess), None
         if self.root_finder is None:
             raise ValueError(
-                f"`{type(view.hamiltonian).__name__}` is not separable here, so "
+                f"This `{type(view.hamiltonian).__name__}` is not separable, so "
                 f"`{type(self).__name__}` is implicit. Pass a root finder, for example "
                 "`root_finder=optimistix.Newton(rtol=1e-10, atol=1e-10)`; or use "
                 "`PresymplecticTao()`, which is explicit; or, if the energy is a sum "

@@ -55,6 +55,8 @@ class AbstractComposition(AbstractPresymplecticSolver[PyTree]):
                 f"Compositions need a symmetric base, which `{type(base).__name__}` is "
                 "not. Compose `PresymplecticLeapfrog()` instead."
             )
+        while isinstance(base, AbstractComposition):
+            base = base.base
         if isinstance(base, PresymplecticTao) and base.coupling is None:
             raise ValueError(
                 "Inside a composition `PresymplecticTao` needs a coupling that does "
@@ -123,7 +125,11 @@ class Composition(AbstractComposition):
                 f"`weights` must sum to one, but sum to {total}. To scale them, divide "
                 "by their sum."
             )
-        _check_order(order, smallest=1)
+        if order is not None and (not isinstance(order, int) or order < 1):
+            raise ValueError(
+                "`Composition(..., order=...)` must be a positive integer, or left "
+                f"away to claim no more than the order of the base, but got {order!r}."
+            )
         self.base = base
         self.weights = weights
         self.composed_order = order
@@ -194,11 +200,10 @@ class SuzukiYoshida(AbstractComposition):
         `ValueError` if the order is not a positive even number, or the base is not
         symmetric.
         """
-        _check_order(order, smallest=2)
-        if order % 2 != 0:
+        if not isinstance(order, int) or order < 2 or order % 2 != 0:
             raise ValueError(
-                f"`SuzukiYoshida(order)` needs an even order, but got {order}. Write "
-                f"`SuzukiYoshida({order + 1})`."
+                "`SuzukiYoshida(order)` needs a positive even integer, for example "
+                f"`SuzukiYoshida(4)`, but got {order!r}."
             )
         self.base = base
         self.weights = triple_jump(order)
@@ -402,7 +407,10 @@ class Substeps(AbstractComposition):
         `ValueError` if `n` is not a positive integer.
         """
         if not isinstance(n, int) or n < 1:
-            raise ValueError(f"`Substeps(base, n)` needs a positive n, but got {n!r}.")
+            raise ValueError(
+                "`Substeps(base, n)` needs a positive Python integer `n`, for example "
+                f"`Substeps(PresymplecticLeapfrog(), 10)`, but got {n!r}."
+            )
         self.base = base
         self.weights = (1 / n,) * n
 
@@ -420,10 +428,3 @@ def triple_jump(order: int) -> Weights:
             outer, inner = 1 / (2 - kappa), -kappa / (2 - kappa)
             weights = [j * w for j in (outer, inner, outer) for w in weights]
         return tuple(float(w) for w in weights)
-
-
-def _check_order(order, smallest: int) -> None:
-    if order is not None and (not isinstance(order, int) or order < smallest):
-        raise ValueError(
-            f"`order` must be an integer of at least {smallest}, but got {order!r}."
-        )

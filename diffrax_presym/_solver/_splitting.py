@@ -76,7 +76,7 @@ class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
         if not view.hamiltonian.is_split:
             raise ValueError(
                 f"`{name}` needs a Hamiltonian split into a kinetic part and a "
-                f"potential, but `{type(view.hamiltonian).__name__}` is not here. "
+                f"potential, but this `{type(view.hamiltonian).__name__}` is not. "
                 "Write it as a `SeparableHamiltonian(kinetic, potential)` if it is "
                 "one, or use `PresymplecticTao()`."
             )
