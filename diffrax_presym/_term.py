@@ -6,8 +6,8 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Inexact, PyTree
 
 from ._hamiltonian import AbstractHamiltonian
-from ._hamiltonian._damping import move_frame
-from ._misc import cast_to, tree_add, tree_scale
+from ._hamiltonian._damping import add_friction, move_frame
+from ._misc import cast_to, tree_scale
 
 
 State = tuple[PyTree[Inexact[Array, "..."]], PyTree[Inexact[Array, "..."]]]
@@ -107,9 +107,7 @@ class View(eqx.Module):
         """The full vector field, of which the force may be known already."""
         damping = self.hamiltonian.damping
         force = self.force(t, y) if force is None else force
-        if damping is not None:
-            force = tree_add(force, -damping.rate(t), y[1])
-        return self.velocity(t, y), force
+        return self.velocity(t, y), add_friction(damping, t, force, y[1])
 
     def bend(self, t, y: State, slope: State) -> State:
         """The rate of change of the slope along the flow, the second derivative."""
@@ -133,7 +131,7 @@ def view(terms: PyTree, args: PyTree) -> View:
             "`RecursiveCheckpointAdjoint()`."
         )
     raise ValueError(
-        "Presymplectic solvers step a `HamiltonianTerm`, but got a "
+        "Presymplectic solvers step a `HamiltonianTerm`, but got "
         f"`{type(term).__name__}`. Write `HamiltonianTerm(hamiltonian)`, or "
         "`HamiltonianTerm(VectorField(velocity, force))` for a hand-written vector "
         "field."
@@ -142,7 +140,7 @@ def view(terms: PyTree, args: PyTree) -> View:
 
 def check_state(y: PyTree) -> None:
     wanted = "The state must be a pair `(q, p)` of positions and momenta"
-    if not isinstance(y, tuple | list) or len(y) != 2:
+    if type(y) is not tuple or len(y) != 2:
         raise ValueError(f"{wanted}, but got {_describe(y)}. Write `y0=(q0, p0)`.")
     q, p = y
     if _describe(q) != _describe(p):

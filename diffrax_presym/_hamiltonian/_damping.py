@@ -187,16 +187,27 @@ def move_frame(damping: AbstractDamping | None, t: Time, h: Time, p: PyTree) -> 
     """`exp(eta(t) - eta(t + h)) p`: from the frame of `t` to the frame of `t + h`."""
     if damping is None:
         return p
-    increment = damping.increment(t, h)
-    if jnp.shape(increment) != ():
-        raise ValueError(
-            "The damping must be one number for the whole system, but has shape "
-            f"{jnp.shape(increment)}. The momenta share one frame; solve systems with "
-            "different dampings side by side with `jax.vmap`."
-        )
+    increment = _one_number(damping.increment(t, h))
     # As a factor, rounding would make the same error at every step, and errors that are
     # the same add up. As an increment they vary with `p`, and mostly cancel.
     return tree_add(p, jnp.expm1(-increment), p)
+
+
+def add_friction(damping: AbstractDamping | None, t: Time, force: PyTree, p: PyTree):
+    """`force - eta'(t) p`: the whole rate of change of the momentum."""
+    if damping is None:
+        return force
+    return tree_add(force, -_one_number(damping.rate(t)), p)
+
+
+def _one_number(damping: Scalar) -> Scalar:
+    if jnp.shape(damping) != ():
+        raise ValueError(
+            "The damping must be one number for the whole system, but has shape "
+            f"{jnp.shape(damping)}. The momenta share one frame; solve systems with "
+            "different dampings side by side with `jax.vmap`."
+        )
+    return damping
 
 
 def quadrature(fn: Callable, h: Time, order: int) -> PyTree:

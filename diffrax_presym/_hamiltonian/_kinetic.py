@@ -95,7 +95,8 @@ class QuadraticKinetic(AbstractKinetic):
             raise ValueError(
                 "`QuadraticKinetic(mass)` must be one mass, or a pytree of masses of "
                 f"the structure of `p`, {jtu.tree_structure(p)}, but got "
-                f"{jtu.tree_structure(mass)}."
+                f"{jtu.tree_structure(mass)}. A list of numbers for one array `p` is "
+                "`jnp.array(mass)`."
             )
         return jtu.tree_map(_divide, p, mass)
 
@@ -159,6 +160,12 @@ class RelativisticKinetic(AbstractKinetic):
     def _norm(self, p):
         square = tree_dot(p, p)
         rest = cast_to(self.mass, square) * cast_to(self.speed, square)
+        if rest.shape != ():
+            raise ValueError(
+                "`RelativisticKinetic` is the energy of one particle with one mass and "
+                f"one speed of light, but these have shape {rest.shape}. For several "
+                "particles write their energy as a function `T(t, p, args)`."
+            )
         return jnp.sqrt(square + rest**2)
 
     @property
