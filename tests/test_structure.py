@@ -223,14 +223,6 @@ def swinging_slope(t, q):
 
 
 PAIRS = {
-    "constant": (
-        quadratic(dps.ConstantDamping(0.7)),
-        Canonical(
-            lambda t, q, P: np.exp(-0.7 * t) * np.linalg.solve(np.asarray(MASS), P),
-            lambda t, q, P: np.exp(0.7 * t) * swinging_slope(t, q),
-            lambda t: 0.7 * t,
-        ),
-    ),
     "logarithmic": (
         quadratic(dps.LogDamping(3.0)),
         Canonical(
