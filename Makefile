@@ -11,7 +11,7 @@ PIP := -m pip --quiet --disable-pip-version-check install
 WORKERS ?= 2
 
 EXAMPLES := $(sort $(filter-out examples/_%,$(wildcard examples/*.py)))
-BENCHMARKS := $(sort $(filter-out benchmarks/_%,$(wildcard benchmarks/*.py)))
+BENCHMARKS := against_loop compile_time schemes work_precision batches
 
 # No window is ever opened: figures go to files.
 export MPLBACKEND ?= Agg
@@ -60,8 +60,8 @@ examples: $(VENV)/.with-examples  ## Run every example, quickly
 	done
 
 bench: $(VENV)/.with-benchmarks  ## Run every benchmark
-	@set -e; for script in $(BENCHMARKS); do \
-		echo "--- $$script"; $(BIN)/python $$script; \
+	@set -e; for name in $(BENCHMARKS); do \
+		echo "--- $$name"; $(BIN)/python benchmarks/$$name.py; \
 	done
 
 clean:  ## Remove the environments and everything that was built

@@ -32,7 +32,7 @@ def scipy_runs(problem, tolerances):
 def heyoka_runs(problem, tolerances):
     """heyoka's Taylor integrator, compiled once for each tolerance."""
     try:
-        import heyoka as hy
+        import heyoka as hy  # pyright: ignore[reportMissingImports]
     except ImportError:
         return []
     equations = symbolic(problem, hy)
