@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Inexact, PyTree, Real
+from jaxtyping import Array, ArrayLike, Inexact, PyTree, Real
 
 from .._misc import as_parameter, cast_to, tree_add, tree_scale
 
@@ -95,7 +95,7 @@ class LogDamping(AbstractDamping):
     gamma: Scalar
     shift: Scalar
 
-    def __init__(self, gamma, shift=0.0):
+    def __init__(self, gamma, shift: ArrayLike = 0.0):
         """**Arguments:**
 
         - `gamma`: the strength of the damping, a dimensionless number of any sign.

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
-from jaxtyping import Array, Inexact, PyTree
+from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
 from .._misc import as_parameter, as_positive, cast_to, scalar_fn, tree_dot, tree_scale
 from ._damping import AbstractDamping, quadrature, Scalar, Time
@@ -144,7 +144,7 @@ class RelativisticKinetic(AbstractKinetic):
     mass: Scalar
     speed: Scalar
 
-    def __init__(self, mass=1.0, speed=1.0):
+    def __init__(self, mass: ArrayLike = 1.0, speed: ArrayLike = 1.0):
         """**Arguments:**
 
         - `mass`: the rest mass $m$, a positive number. Defaults to 1.
