@@ -1,0 +1,518 @@
+"""Bad input gets a clear error before any compute.
+
+Each message says what was given, what is needed, and what to write instead.
+"""
+
+import re
+from collections.abc import Callable
+from typing import NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import optimistix as optx
+import pytest
+from helpers import each, harmonic, mixed_energy, oscillator, Scheme
+
+import diffrax_presym as dps
+
+
+TERM = dps.HamiltonianTerm(oscillator())
+KINETIC = dps.QuadraticKinetic()
+DAMPING = dps.ConstantDamping(0.2)
+LEAPFROG = dps.PresymplecticLeapfrog()
+PAIR = (jnp.ones(2), jnp.ones(2))
+NONSEPARABLE = {
+    "undamped": dps.Hamiltonian(mixed_energy),
+    "damped": dps.ConformalHamiltonian(energy=mixed_energy, damping=DAMPING),
+}
+
+
+def trace(term, solver, y0=PAIR, **kwargs):
+    """Trace a solve. Nothing is computed, so what is raised is raised before."""
+    dtype = kwargs.pop("dtype", jnp.float64)
+    t0, t1, dt0 = (jnp.array(t, dtype) for t in (0.0, 1.0, 0.1))
+    run = lambda y0: dfx.diffeqsolve(term, solver, t0, t1, dt0, y0, **kwargs).ys
+    eqx.filter_eval_shape(run, y0)
+
+
+def system(kinetic: Callable = KINETIC, potential=harmonic, **kwargs):
+    """Trace a solve of a system whose parts are wrong."""
+    hamiltonian = dps.ConformalHamiltonian(kinetic, potential, **kwargs)
+    trace(dps.HamiltonianTerm(hamiltonian), LEAPFROG)
+
+
+class Mistake(NamedTuple):
+    given: str
+    needed: str
+    instead: str
+
+    def check(self, error: pytest.ExceptionInfo):
+        message = str(error.value)
+        for part in self:
+            assert part in message
+
+
+def mistakes(cases):
+    return pytest.mark.parametrize(
+        "act, mistake", list(cases.values()), ids=list(cases)
+    )
+
+
+# States
+
+STATE = "The state must be a pair `(q, p)` of positions and momenta"
+ALIKE = f"{STATE} of one structure, shape and precision"
+REAL = f"{STATE} in real floating point"
+x, x32 = jnp.ones(2), jnp.ones(2, jnp.float32)
+
+STATES = {
+    "an array": (x, Mistake("got float64[2]", STATE, "Write `y0=(q0, p0)`")),
+    "a list": ([x, x], Mistake("got [float64[2], ", STATE, "Write `y0=(q0, p0)`")),
+    "a triple": ((x, x, x), Mistake("(float64[2], ", STATE, "Write `y0=(q0, p0)`")),
+    "a dict": (
+        {"q": x, "p": x},
+        Mistake("{p: float64[2], q: float64[2]}", STATE, "Write `y0=(q0, p0)`"),
+    ),
+    "structures": (
+        ({"a": x}, {"b": x}),
+        Mistake("q of {a: float64[2]} and p of {b: float64[2]}", ALIKE, "one"),
+    ),
+    "array and structure": (
+        (x, {"b": x}),
+        Mistake("q of float64[2] and p of {b: float64[2]}", ALIKE, "one"),
+    ),
+    "shapes": (
+        (x, jnp.ones(3)),
+        Mistake("q of float64[2] and p of float64[3]", ALIKE, "shape"),
+    ),
+    "precisions": (
+        (x, x32),
+        Mistake("q of float64[2] and p of float32[2]", ALIKE, "precision"),
+    ),
+}
+
+
+@pytest.mark.parametrize("y0, mistake", list(STATES.values()), ids=list(STATES))
+@pytest.mark.parametrize("solver", [LEAPFROG, dfx.Tsit5()], ids=["ours", "Diffrax's"])
+def test_states(y0, mistake, solver):
+    # In single precision: `diffeqsolve` takes states to the precision of time at least.
+    with pytest.raises(ValueError) as error:
+        trace(TERM, solver, y0, dtype=jnp.float32)
+    mistake.check(error)
+
+
+@each()
+def test_states_for_every_scheme(scheme: Scheme):
+    with pytest.raises(ValueError, match=re.escape(STATE)):
+        trace(TERM, scheme.solver, x)
+
+
+@pytest.mark.filterwarnings("ignore:Complex dtype support")
+def test_complex_states():
+    y0 = (jnp.ones(2, complex), jnp.ones(2, complex))
+    with pytest.raises(ValueError) as error:
+        trace(TERM, LEAPFROG, y0)
+    Mistake("complex128[2]", REAL, "its real and imaginary parts").check(error)
+
+
+@each()
+def test_integer_states_are_for_diffeqsolve_to_convert(scheme: Scheme):
+    y0 = (jnp.ones(2, int), jnp.ones(2, int))
+    t0, t1 = jnp.array(0.0), jnp.array(0.1)
+    with pytest.raises(ValueError) as error:
+        eqx.filter_eval_shape(scheme.solver.init, TERM, t0, t1, y0, None)
+    Mistake("int64[2]", REAL, "`jnp.asarray(x, float)`").check(error)
+
+
+# Terms
+
+ODE = dfx.ODETerm(lambda t, y, args: y)
+STEPPED = "Presymplectic solvers step a `HamiltonianTerm`"
+HAND_WRITTEN = "`HamiltonianTerm(VectorField(velocity, force))` for a hand-written"
+
+
+@each()
+def test_terms_of_another_kind(scheme: Scheme):
+    with pytest.raises(ValueError) as error:
+        trace(ODE, scheme.solver)
+    Mistake("got `ODETerm`", STEPPED, HAND_WRITTEN).check(error)
+
+
+def test_several_terms_in_one():
+    with pytest.raises(ValueError) as error:
+        trace(dfx.MultiTerm(ODE, ODE), LEAPFROG)
+    Mistake("got `MultiTerm`", STEPPED, HAND_WRITTEN).check(error)
+
+
+def test_the_terms_of_semi_implicit_euler():
+    # Refused by Diffrax before a solver is asked, which says that one term is expected.
+    with pytest.raises(ValueError) as error:
+        trace((ODE, ODE), LEAPFROG)
+    message = "Terms are not compatible with solver"
+    Mistake("(ODETerm(", message, "expected:\ndiffrax.AbstractTerm").check(error)
+
+
+@pytest.mark.parametrize("given", [oscillator, harmonic, ODE])
+def test_terms_hold_a_hamiltonian(given):
+    with pytest.raises(ValueError) as error:
+        dps.HamiltonianTerm(given)
+    instead = "`HamiltonianTerm(SeparableHamiltonian(kinetic, potential))`"
+    Mistake(repr(given), "needs a Hamiltonian", instead).check(error)
+
+
+def test_backsolve_adjoint_with_the_same_solver():
+    def loss(y0):
+        t = (0.0, 1.0, 0.1)
+        adjoint = dfx.BacksolveAdjoint()
+        sol = dfx.diffeqsolve(TERM, LEAPFROG, *t, y0, adjoint=adjoint)
+        assert sol.ys is not None
+        return jnp.sum(sol.ys[0])
+
+    loss(PAIR)  # The solve itself has nothing to complain of.
+    with pytest.raises(ValueError) as error:
+        eqx.filter_eval_shape(jax.grad(loss), PAIR)
+    instead = "`BacksolveAdjoint(solver=diffrax.Tsit5())`"
+    Mistake("`BacksolveAdjoint()`", "not Hamiltonian", instead).check(error)
+
+
+# Energies that a scheme cannot step
+
+
+@pytest.mark.parametrize("hamiltonian", list(NONSEPARABLE.values()), ids=NONSEPARABLE)
+@each(kinds=("frozen",))
+def test_nonseparable_energies_need_a_root_finder(scheme: Scheme, hamiltonian):
+    with pytest.raises(ValueError) as error:
+        trace(dps.HamiltonianTerm(hamiltonian), scheme.solver)
+    message = str(error.value)
+    assert f"This `{type(hamiltonian).__name__}` is not separable" in message
+    # All three ways out.
+    assert "`root_finder=optimistix.Newton(rtol=1e-10, atol=1e-10)`" in message
+    assert "`PresymplecticTao()`" in message
+    assert "`SeparableHamiltonian`" in message
+
+
+SPLIT = "a Hamiltonian split into a kinetic part and a potential"
+
+
+@pytest.mark.parametrize("solver", [dps.BlanesMoan4(), dps.BlanesMoanRKN4()])
+def test_splittings_need_a_split_energy(solver):
+    with pytest.raises(ValueError) as error:
+        trace(dps.HamiltonianTerm(NONSEPARABLE["undamped"]), solver)
+    Mistake("this `Hamiltonian` is not", SPLIT, "`PresymplecticTao()`").check(error)
+
+
+def test_nystroem_splittings_need_a_quadratic_kinetic_energy():
+    hamiltonian = dps.SeparableHamiltonian(dps.RelativisticKinetic(), harmonic)
+    with pytest.raises(ValueError) as error:
+        trace(dps.HamiltonianTerm(hamiltonian), dps.BlanesMoanRKN4())
+    needed = "quadratic in the momentum, and known to be"
+    Mistake("`BlanesMoanRKN4`", needed, "`BlanesMoan4()`").check(error)
+
+
+@pytest.mark.parametrize("solver", [LEAPFROG, dps.PresymplecticTao()])
+def test_step_sizes_by_error_estimate(solver):
+    # The message is Diffrax's, which does not ask the solver for one.
+    controller = dfx.PIDController(rtol=1e-3, atol=1e-3)
+    with pytest.raises(RuntimeError, match="solver that does not provide error est"):
+        trace(TERM, solver, stepsize_controller=controller)
+
+
+# Solvers
+
+EVEN = "`SuzukiYoshida(order)` needs a positive even integer"
+ROOT_FINDER = "`root_finder` must be an Optimistix root finder"
+NEWTON = "`optimistix.Newton(rtol=1e-10, atol=1e-10)`"
+SYMMETRIC = "Compositions need a symmetric base"
+BASE = "`base` must be a presymplectic solver"
+SUM = "`weights` must sum to one"
+FIXED = "a coupling that does not change with the step"
+WITHOUT_TOLERANCES = dfx.with_stepsize_controller_tols(dfx.VeryChord)()
+
+SOLVERS = {
+    **{
+        f"order {order!r}": (
+            lambda order=order: dps.SuzukiYoshida(order),  # type: ignore
+            Mistake(f"got {order!r}", EVEN, "`SuzukiYoshida(4)`"),
+        )
+        for order in (3, 0, -2, 4.0, None)
+    },
+    "order of a composition": (
+        lambda: dps.Composition(LEAPFROG, [1.0], order=0),
+        Mistake("got 0", "must be a positive integer", "left away"),
+    ),
+    "weights": (
+        lambda: dps.Composition(LEAPFROG, [0.5, 0.25]),
+        Mistake("sum to 0.75", SUM, "divide by their sum"),
+    ),
+    "weights almost": (
+        lambda: dps.Composition(LEAPFROG, [0.5, 0.5 + 1e-9]),
+        Mistake("sum to 1.000000001", SUM, "divide by their sum"),
+    ),
+    "no weights": (
+        lambda: dps.Composition(LEAPFROG, []),
+        Mistake("sum to 0.0", SUM, "divide by their sum"),
+    ),
+    "base of a triple jump": (
+        lambda: dps.SuzukiYoshida(4, base=dps.PresymplecticEuler()),
+        Mistake("`PresymplecticEuler`", SYMMETRIC, "Compose `PresymplecticLeapfrog()`"),
+    ),
+    "base of a tabulated composition": (
+        lambda: dps.Suzuki4(dps.PresymplecticEuler()),
+        Mistake("`PresymplecticEuler`", SYMMETRIC, "Compose `PresymplecticLeapfrog()`"),
+    ),
+    "base of weights": (
+        lambda: dps.Composition(dps.PresymplecticEuler(), [0.25, 0.5, 0.25]),
+        Mistake("`PresymplecticEuler`", SYMMETRIC, "Compose `PresymplecticLeapfrog()`"),
+    ),
+    "base is Diffrax's": (
+        lambda: dps.Suzuki4(dfx.Tsit5()),  # type: ignore
+        Mistake("got Tsit5()", BASE, "`PresymplecticLeapfrog()`"),
+    ),
+    "base is a class": (
+        lambda: dps.Substeps(dps.PresymplecticLeapfrog, 2),  # type: ignore
+        Mistake("got <class ", BASE, "`PresymplecticLeapfrog()`"),
+    ),
+    "Tao in a composition": (
+        lambda: dps.SuzukiYoshida(4, base=dps.PresymplecticTao()),
+        Mistake("`PresymplecticTao` needs", FIXED, "`PresymplecticTao(coupling)`"),
+    ),
+    "Tao further in": (
+        lambda: dps.Suzuki4(dps.Substeps(dps.PresymplecticTao(), 2)),
+        Mistake("`PresymplecticTao` needs", FIXED, "`PresymplecticTao(coupling)`"),
+    ),
+    **{
+        f"coupling {given}": (
+            lambda given=given: dps.PresymplecticTao(given),
+            Mistake(f"got {given}", "must be positive", "`PresymplecticTao(coupling)`"),
+        )
+        for given in (0.0, -1.0, float("nan"))
+    },
+    "coupling of another kind": (
+        lambda: dps.PresymplecticTao("strong"),
+        Mistake("'strong'", "a real number", "`PresymplecticTao(coupling)`"),
+    ),
+    **{
+        f"first {given!r}": (
+            lambda given=given: dps.PresymplecticLeapfrog(first=given),  # type: ignore
+            Mistake(f"got {given!r}", "`first` must be", '"momentum" or "position"'),
+        )
+        for given in ("q", None)
+    },
+    "root finder by name": (
+        lambda: dps.PresymplecticLeapfrog(root_finder="newton"),  # type: ignore
+        Mistake("got 'newton'", ROOT_FINDER, NEWTON),
+    ),
+    "root finder as a class": (
+        lambda: dps.PresymplecticLeapfrog(root_finder=optx.Newton),  # type: ignore
+        Mistake("got <class ", ROOT_FINDER, NEWTON),
+    ),
+    "a minimiser": (
+        lambda: dps.PresymplecticYoshida4(
+            root_finder=optx.BFGS(rtol=1e-3, atol=1e-3)  # type: ignore
+        ),
+        Mistake("got BFGS(", ROOT_FINDER, NEWTON),
+    ),
+    "root finder without tolerances": (
+        lambda: dps.PresymplecticEuler(root_finder=WITHOUT_TOLERANCES),
+        Mistake("`root_finder` needs", "a tolerance `rtol` of its own", NEWTON),
+    ),
+    **{
+        f"substeps {n!r}": (
+            lambda n=n: dps.Substeps(LEAPFROG, n),  # type: ignore
+            Mistake(
+                f"got {n!r}",
+                "needs a positive Python integer `n`",
+                "`Substeps(PresymplecticLeapfrog(), 10)`",
+            ),
+        )
+        for n in (0, -1, 2.0, None)
+    },
+}
+
+
+@mistakes(SOLVERS)
+def test_solvers(act, mistake):
+    with pytest.raises(ValueError) as error:
+        act()
+    mistake.check(error)
+
+
+def test_equal_weights_ask_nothing_of_the_base():
+    dps.Substeps(dps.PresymplecticEuler(), 3)
+    dps.Substeps(dps.PresymplecticTao(), 3)
+    dps.Composition(dps.PresymplecticEuler(), [0.5, 0.5])
+
+
+# Hamiltonians
+
+POSITIVE = "must be positive"
+ONE_NUMBER = "must return one real number, the energy of the whole system"
+SUM_OVER = "`jnp.sum(...)`"
+MASS = "`QuadraticKinetic(mass)`"
+LAW = "must be a damping law or a function eta(t)"
+RATE = "`ConstantDamping(rate)`"
+ONE_DAMPING = "must be one number for the whole system"
+EITHER = "either `kinetic` and `potential`, or `energy`"
+VECTOR = jnp.array([0.1, 0.2])
+
+HAMILTONIANS = {
+    **{
+        f"mass {given}": (
+            lambda given=given: dps.QuadraticKinetic(given),
+            Mistake(f"got {given}", POSITIVE, MASS),
+        )
+        for given in (0.0, -1.0, np.array([1.0, -2.0]))
+    },
+    "mass of another kind": (
+        lambda: dps.QuadraticKinetic("heavy"),
+        Mistake("got 'heavy'", "must be a real number", MASS),
+    ),
+    "complex mass": (
+        lambda: dps.QuadraticKinetic(1j),
+        Mistake("got 1j", "must be real", MASS),
+    ),
+    "mass of a wrong shape": (
+        lambda: system(dps.QuadraticKinetic(jnp.ones(3))),
+        Mistake("of shape (3,)", "does not fit `p` of shape (2,)", "Pass a number, or"),
+    ),
+    "matrix of a wrong shape": (
+        lambda: system(dps.QuadraticKinetic(jnp.eye(3))),
+        Mistake("got shape (3, 3)", "for `p` of shape (2,)", "one row and column for"),
+    ),
+    "operator of a wrong shape": (
+        lambda: system(dps.QuadraticKinetic(lx.DiagonalLinearOperator(jnp.ones(3)))),
+        Mistake("shape=(3,)", "shape=(2,)", "do not match"),
+    ),
+    "mass of a wrong structure": (
+        lambda: system(dps.QuadraticKinetic({"a": 1.0})),
+        Mistake("got PyTreeDef({'a': *})", "of the structure of `p`", "one mass"),
+    ),
+    "list of masses": (
+        lambda: system(dps.QuadraticKinetic([1.0, 2.0])),
+        Mistake("got PyTreeDef([*, *])", "of the structure", "`jnp.array(mass)`"),
+    ),
+    "rest mass": (
+        lambda: dps.RelativisticKinetic(mass=0.0),
+        Mistake("got 0.0", POSITIVE, "`RelativisticKinetic(mass=...)`"),
+    ),
+    "speed of light": (
+        lambda: dps.RelativisticKinetic(speed=-1.0),
+        Mistake("got -1.0", POSITIVE, "`RelativisticKinetic(speed=...)`"),
+    ),
+    "rest masses": (
+        lambda: system(dps.RelativisticKinetic(mass=VECTOR)),
+        Mistake("shape (2,)", "one particle with one mass", "`T(t, p, args)`"),
+    ),
+    "potential of many numbers": (
+        lambda: system(potential=lambda t, q, args: q**2),
+        Mistake("The potential", f"{ONE_NUMBER}, but returned float64[2]", SUM_OVER),
+    ),
+    "potential of none": (
+        lambda: system(potential=lambda t, q, args: None),
+        Mistake("The potential", f"{ONE_NUMBER}, but returned None", SUM_OVER),
+    ),
+    "kinetic energy of many numbers": (
+        lambda: system(lambda t, p, args: p**2),
+        Mistake("The kinetic energy", f"{ONE_NUMBER}, but returned float64", SUM_OVER),
+    ),
+    "energy of many numbers": (
+        lambda: trace(
+            dps.HamiltonianTerm(dps.Hamiltonian(lambda t, q, p, args: q * p)),
+            dps.PresymplecticTao(),
+        ),
+        Mistake("The energy", f"{ONE_NUMBER}, but returned float64[2]", SUM_OVER),
+    ),
+    "potential is no function": (
+        lambda: dps.SeparableHamiltonian(KINETIC, 3.0),
+        Mistake("got 3.0", "`potential` must be a function", "`V(t, q, args)`"),
+    ),
+    "kinetic energy is no function": (
+        lambda: dps.SeparableHamiltonian(2.0, harmonic),
+        Mistake("got 2.0", "a kinetic energy or a function `T(t, p, args)`", MASS),
+    ),
+    "energy is no function": (
+        lambda: dps.Hamiltonian(3.0),
+        Mistake("got 3.0", "`energy` must be a function", "`E(t, q, p, args)`"),
+    ),
+    "force of a wrong shape": (
+        lambda: system(force=lambda t, q, args: jnp.ones(3)),
+        Mistake("returned shape (3,)", "arrays of the shapes of `q`", "of shape (2,)"),
+    ),
+    "force of a wrong structure": (
+        lambda: system(force=lambda t, q, args: (q, q)),
+        Mistake("returned PyTreeDef((*, *))", "the same structure as `q`", "`force`"),
+    ),
+    "velocity of a wrong shape": (
+        lambda: system(velocity=lambda t, p, args: jnp.ones(3)),
+        Mistake("returned shape (3,)", "arrays of the shapes of `p`", "of shape (2,)"),
+    ),
+    "hand-written field is no function": (
+        lambda: dps.VectorField(1.0, 2.0),  # type: ignore
+        Mistake("got 1.0", "must be a function", "`velocity(t, p, args)`"),
+    ),
+    "damping by a number": (
+        lambda: dps.ConformalHamiltonian(KINETIC, harmonic, 0.2),
+        Mistake("got 0.2", LAW, RATE),
+    ),
+    "damping of the general family by a number": (
+        lambda: dps.DissipativeHamiltonian(KINETIC, harmonic, DAMPING, 0.2),
+        Mistake("got 0.2", f"`eta2` {LAW}", RATE),
+    ),
+    "damping of a field by a number": (
+        lambda: dps.VectorField(lambda t, p, a: p, lambda t, q, a: -q, 0.2),  # type: ignore
+        Mistake("got 0.2", LAW, RATE),
+    ),
+    "rate of another kind": (
+        lambda: dps.ConstantDamping("weak"),
+        Mistake("got 'weak'", "must be a real number", "`ConstantDamping(gamma)`"),
+    ),
+    "neither energy": (
+        lambda: dps.ConformalHamiltonian(damping=DAMPING),
+        Mistake("needs", EITHER, "`ConformalHamiltonian(kinetic, potential, damping)`"),
+    ),
+    "both energies": (
+        lambda: dps.ConformalHamiltonian(KINETIC, harmonic, energy=mixed_energy),
+        Mistake("needs", EITHER, "`ConformalHamiltonian(kinetic, potential, damping)`"),
+    ),
+    "energy of a hand-written field": (
+        lambda: dps.VectorField(lambda t, p, a: p, lambda t, q, a: -q).energy(
+            jnp.array(0.0), *PAIR
+        ),
+        Mistake(
+            "A `VectorField` has no energy",
+            "an energy T(t, p) + V(t, q)",
+            "`ConformalHamiltonian(kinetic, potential, damping)`",
+        ),
+    ),
+    "exact drift of an energy that is not split": (
+        lambda: NONSEPARABLE["damped"].drift(jnp.array(0.0), jnp.array(0.1), *PAIR),
+        Mistake("`Hamiltonian(energy)`", "not split", "`PresymplecticTao()`"),
+    ),
+}
+
+
+@mistakes(HAMILTONIANS)
+def test_hamiltonians(act, mistake):
+    with pytest.raises(ValueError) as error:
+        act()
+    mistake.check(error)
+
+
+@pytest.mark.parametrize("law", [dps.ConstantDamping(VECTOR), lambda t: VECTOR * t])
+@pytest.mark.parametrize(
+    "solver", [LEAPFROG, dps.PresymplecticTao(), dps.BlanesMoan4(), dfx.Tsit5()]
+)
+def test_one_damping_for_all_momenta(law, solver):
+    hamiltonian = dps.ConformalHamiltonian(KINETIC, harmonic, law)
+    with pytest.raises(ValueError) as error:
+        trace(dps.HamiltonianTerm(hamiltonian), solver)
+    Mistake("has shape (2,)", ONE_DAMPING, "`jax.vmap`").check(error)
+
+
+def test_masses_not_yet_known_are_not_judged():
+    mass = eqx.filter_eval_shape(dps.QuadraticKinetic, jnp.array(-1.0)).mass
+    assert mass.shape == ()
