@@ -49,26 +49,28 @@ def tree_dot(x: PyTree, y: PyTree) -> Array:
         return jtu.tree_reduce(jnp.add, dots)
 
 
+def describe(tree: PyTree) -> str:
+    """A pytree by the precisions and shapes of its leaves, for errors."""
+    leaf = lambda x: f"{jnp.result_type(x)}{list(jnp.shape(x))}"
+    return str(jtu.tree_map(leaf, tree)).replace("'", "")
+
+
 def scalar_fn(fn, name: str):
     """`fn`, with a clear error should it return anything but one real number."""
 
     def checked(*args):
         out = fn(*args)
         leaves = jtu.tree_leaves(out)
-        if (
-            len(leaves) != 1
-            or jnp.shape(leaves[0]) != ()
-            or not jnp.issubdtype(jnp.result_type(leaves[0]), jnp.floating)
-        ):
-            got = jtu.tree_map(
-                lambda x: f"{jnp.result_type(x)}{list(jnp.shape(x))}", out
-            )
-            raise ValueError(
-                f"{name} must return one real number, the energy of the whole system, "
-                f"but returned {got}. Sum over the degrees of freedom, for example "
-                "`jnp.sum(...)`."
-            )
-        return leaves[0]
+        if len(leaves) != 1 or jnp.shape(leaves[0]) != ():
+            instead = "Sum over the degrees of freedom, for example `jnp.sum(...)`."
+        elif not jnp.issubdtype(jnp.result_type(leaves[0]), jnp.floating):
+            instead = "Convert it to floating point, a complex number by `jnp.real`."
+        else:
+            return leaves[0]
+        raise ValueError(
+            f"{name} must return one real number, the energy of the whole system, but "
+            f"returned {describe(out)}. {instead}"
+        )
 
     return checked
 
@@ -82,6 +84,12 @@ def match(value: PyTree, like: PyTree, name: str, like_name: str) -> PyTree:
         )
 
     def leaf(v, x):
+        # A cast would drop the imaginary part.
+        if jnp.issubdtype(jnp.result_type(v), jnp.complexfloating):
+            raise ValueError(
+                f"{name} must return real arrays, but returned {describe(v)}. Take "
+                "`jnp.real` of it if that is what is meant."
+            )
         try:
             return jnp.broadcast_to(cast_to(v, x), jnp.shape(x))
         except ValueError as e:

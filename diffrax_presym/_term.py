@@ -7,7 +7,7 @@ from jaxtyping import Array, Inexact, PyTree
 
 from ._hamiltonian import AbstractHamiltonian
 from ._hamiltonian._damping import add_friction, move_frame
-from ._misc import cast_to, tree_scale
+from ._misc import cast_to, describe, tree_scale
 
 
 State = tuple[PyTree[Inexact[Array, "..."]], PyTree[Inexact[Array, "..."]]]
@@ -141,22 +141,17 @@ def view(terms: PyTree, args: PyTree) -> View:
 def check_state(y: PyTree) -> None:
     wanted = "The state must be a pair `(q, p)` of positions and momenta"
     if type(y) is not tuple or len(y) != 2:
-        raise ValueError(f"{wanted}, but got {_describe(y)}. Write `y0=(q0, p0)`.")
+        raise ValueError(f"{wanted}, but got {describe(y)}. Write `y0=(q0, p0)`.")
     q, p = y
-    if _describe(q) != _describe(p):
+    if describe(q) != describe(p):
         raise ValueError(
             f"{wanted} of one structure, shape and precision, but got q of "
-            f"{_describe(q)} and p of {_describe(p)}."
+            f"{describe(q)} and p of {describe(p)}."
         )
     for leaf in jtu.tree_leaves(y):
         if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
             raise ValueError(
-                f"{wanted} in real floating point, but got {_describe(q)}. Convert "
+                f"{wanted} in real floating point, but got {describe(q)}. Convert "
                 "them with `jnp.asarray(x, float)`, a complex number to its real and "
                 "imaginary parts."
             )
-
-
-def _describe(tree) -> str:
-    describe = lambda x: f"{jnp.result_type(x)}{list(jnp.shape(x))}"
-    return str(jtu.tree_map(describe, tree)).replace("'", "")

@@ -8,7 +8,7 @@ from jaxtyping import PyTree
 from .._misc import scalar_fn, tree_scale
 from ._base import AbstractHamiltonian, P, Q
 from ._damping import AbstractDamping, as_damping, Scalar, Time
-from ._energy import Hamiltonian, SeparableHamiltonian
+from ._energy import check_potential, Hamiltonian, SeparableHamiltonian
 from ._kinetic import (
     AbstractKinetic,
     as_kinetic,
@@ -151,6 +151,7 @@ class DissipativeHamiltonian(_AbstractDamped):
         """
         eta1 = as_damping(eta1, "`eta1`")
         eta2 = as_damping(eta2, "`eta2`")
+        check_potential(potential)
         if separable:
             kinetic = _ScaledKinetic(as_kinetic(kinetic), eta1, eta2)
             self.undamped = SeparableHamiltonian(kinetic, potential)

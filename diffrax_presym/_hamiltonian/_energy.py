@@ -7,13 +7,26 @@ from jaxtyping import PyTree
 
 from .._misc import match, scalar_fn, tree_add
 from ._base import AbstractHamiltonian, P, Q
-from ._damping import move_frame, Scalar, Time
+from ._damping import AbstractDamping, move_frame, Scalar, Time
 from ._kinetic import AbstractKinetic, as_kinetic, integrate_velocity
 
 
 def _check_callable(fn, name: str, signature: str, optional: bool = False):
     if not callable(fn) and not (optional and fn is None):
         raise ValueError(f"`{name}` must be a function `{signature}`, but got {fn!r}.")
+
+
+def check_potential(potential):
+    # These can be called with as many arguments, but mean something else: the arguments
+    # are in the wrong order, or an energy that is not separable was given by position.
+    if isinstance(potential, AbstractDamping | AbstractKinetic):
+        raise ValueError(
+            "`potential` must be a function `V(t, q, args)`, but got "
+            f"{potential!r}. The order is `(kinetic, potential, damping)`; an energy "
+            "that is not separable is passed by name, "
+            "`ConformalHamiltonian(energy=energy, damping=damping)`."
+        )
+    _check_callable(potential, "potential", "V(t, q, args)")
 
 
 class SeparableHamiltonian(AbstractHamiltonian):
@@ -47,7 +60,7 @@ class SeparableHamiltonian(AbstractHamiltonian):
         `ValueError` if any of these is of the wrong kind, and when the solve is traced
         if a function returns values of the wrong shape.
         """
-        _check_callable(potential, "potential", "V(t, q, args)")
+        check_potential(potential)
         _check_callable(velocity, "velocity", "velocity(t, p, args)", optional=True)
         _check_callable(force, "force", "force(t, q, args)", optional=True)
         self.kinetic = as_kinetic(kinetic)

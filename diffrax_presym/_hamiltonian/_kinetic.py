@@ -70,9 +70,7 @@ class QuadraticKinetic(AbstractKinetic):
         `p` (when the solve is traced).
         """
         if mass is not None and not isinstance(mass, lx.AbstractLinearOperator):
-            # Off-diagonal entries of a matrix may have any sign.
-            check = lambda m: as_positive if jnp.ndim(m) < 2 else as_parameter
-            mass = jtu.tree_map(lambda m: check(m)(m, "`QuadraticKinetic(mass)`"), mass)
+            mass = jtu.tree_map(_as_mass, mass)
         self.mass = mass
 
     @property
@@ -106,6 +104,16 @@ class QuadraticKinetic(AbstractKinetic):
 
     def rescale(self, s: Scalar) -> "QuadraticKinetic":
         return self
+
+
+def _as_mass(mass):
+    name = "`QuadraticKinetic(mass)`"
+    shape = jnp.shape(mass)
+    if len(shape) != 2 or shape[0] != shape[1]:
+        return as_positive(mass, name)
+    # Perhaps a matrix, whose other entries may have any sign.
+    as_positive(jnp.diagonal(mass), f"The diagonal of {name}")
+    return as_parameter(mass, name)
 
 
 def _divide(p, mass):

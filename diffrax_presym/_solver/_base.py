@@ -182,10 +182,11 @@ class AbstractKickDriftSolver(AbstractPresymplecticSolver[_Carry]):
         if self.root_finder is None:
             raise ValueError(
                 f"This `{type(view.hamiltonian).__name__}` is not separable, so "
-                f"`{type(self).__name__}` is implicit. Pass a root finder, for example "
-                "`root_finder=optimistix.Newton(rtol=1e-10, atol=1e-10)`; or use "
-                "`PresymplecticTao()`, which is explicit; or, if the energy is a sum "
-                "T(t, p) + V(t, q), write it as a `SeparableHamiltonian`."
+                f"`{type(self).__name__}` is implicit. Pass it a root finder, for "
+                "example `root_finder=optimistix.Newton(rtol=1e-10, atol=1e-10)`; or "
+                "use `PresymplecticTao()`, which is explicit; or, if the energy is a "
+                "sum T(t, p) + V(t, q), give its parts: `SeparableHamiltonian(kinetic, "
+                "potential)` or `ConformalHamiltonian(kinetic, potential, damping)`."
             )
         residual = lambda x, _: jtu.tree_map(jnp.subtract, fn(x), x)
         solution = optx.root_find(

@@ -77,8 +77,9 @@ class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
             raise ValueError(
                 f"`{name}` needs a Hamiltonian split into a kinetic part and a "
                 f"potential, but this `{type(view.hamiltonian).__name__}` is not. "
-                "Write it as a `SeparableHamiltonian(kinetic, potential)` if it is "
-                "one, or use `PresymplecticTao()`."
+                "If it is a sum of the two, give its parts: `SeparableHamiltonian("
+                "kinetic, potential)` or `ConformalHamiltonian(kinetic, potential, "
+                "damping)`. For any other use `PresymplecticTao()`."
             )
         if self.tableau.quadratic and not view.hamiltonian.is_quadratic:
             raise ValueError(
@@ -109,18 +110,32 @@ class Splitting(AbstractSplitting):
         **Raises:**
 
         `ValueError` if the drifts or the kicks do not sum to one, or do not take turns
-        from the first move to a last of the same kind.
+        from the first move to a last of the same kind; or if the order is not a
+        positive integer.
         """
-        first, second = tableau.fractions[0::2], tableau.fractions[1::2]
+        if not isinstance(tableau, SplittingTableau):
+            raise ValueError(
+                "`Splitting` needs a tableau, `Splitting(SplittingTableau(order, "
+                f"kick_first, quadratic, fractions))`, but got {tableau!r}."
+            )
+        if not isinstance(tableau.order, int) or tableau.order < 1:
+            raise ValueError(
+                "`SplittingTableau(order=...)` must be a positive integer, but got "
+                f"{tableau.order!r}."
+            )
+        fractions = tuple(float(x) for x in tableau.fractions)
+        first, second = fractions[0::2], fractions[1::2]
         sums = math.fsum(first), math.fsum(second)
-        if len(first) != len(second) + 1 or any(abs(x - 1) > 1e-12 for x in sums):
+        if len(first) != len(second) + 1 or any(not abs(x - 1) < 1e-12 for x in sums):
+            names = ("kicks", "drifts")[:: 1 if tableau.kick_first else -1]
             raise ValueError(
                 "`SplittingTableau(fractions=...)` needs drifts that sum to one and "
                 "kicks that sum to one, by turns, an odd number of moves in all; but "
-                f"got {len(first)} of the first kind that sum to {sums[0]} and "
-                f"{len(second)} of the second that sum to {sums[1]}."
+                f"got {len(first)} {names[0]} that sum to {sums[0]} and {len(second)} "
+                f"{names[1]} that sum to {sums[1]}. To scale them, divide each kind by "
+                "its sum."
             )
-        self.tableau = tableau
+        self.tableau = tableau._replace(fractions=fractions)
 
 
 class BlanesMoan4(AbstractSplitting):

@@ -59,7 +59,8 @@ class PresymplecticTao(AbstractPresymplecticSolver[_Carry]):
 
         **Raises:**
 
-        `ValueError` if `coupling` is known not to be positive.
+        `ValueError` if `coupling` is known not to be positive, and when the solve is
+        traced if it is not one number.
         """
         if coupling is not None:
             coupling = as_positive(coupling, "`PresymplecticTao(coupling)`")
@@ -96,6 +97,12 @@ class PresymplecticTao(AbstractPresymplecticSolver[_Carry]):
     def _angle(self, h):
         if self.coupling is None:
             return jnp.copysign(cast_to(3 * np.pi / 8, h), h)
+        if jnp.shape(self.coupling) != ():
+            raise ValueError(
+                "`PresymplecticTao(coupling)` must be one number, but has shape "
+                f"{jnp.shape(self.coupling)}. To compare several, solve side by side "
+                "with `jax.vmap`."
+            )
         return 2 * cast_to(self.coupling, h) * h
 
 
