@@ -15,7 +15,9 @@ class VectorField(AbstractHamiltonian):
     For forces that have no potential, that are random, or whose potential is not worth
     computing: stochastic gradients, measured force fields. Every scheme for separable
     Hamiltonians steps it, but only if the two do come from an energy is the result
-    (pre)symplectic.
+    (pre)symplectic. Schemes of order above 4 differentiate both for their dense output,
+    so that functions JAX cannot see through, such as a `jax.pure_callback`, need a
+    `jax.custom_jvp` there.
     """
 
     velocity_fn: Callable
