@@ -1,0 +1,117 @@
+"""What this package relies on in Diffrax without a promise, one sentence each.
+
+Should one of these fail after an update of Diffrax, nothing else need be wrong: mend
+`diffrax_presym/_term.py` or `diffrax_presym/_solver/_base.py` accordingly.
+"""
+
+from typing import ClassVar
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import pytest
+from helpers import oscillator
+from jax.core import Tracer
+
+import diffrax_presym as dps
+
+
+TERM = dps.HamiltonianTerm(oscillator())
+Y0 = (jnp.ones(1), jnp.ones(1))
+
+
+class Recorder(dfx.AbstractSolver):
+    """Diffrax's own Euler method, which writes down what it is called with."""
+
+    term_structure: ClassVar = dfx.AbstractTerm
+    interpolation_cls: ClassVar = dfx.LocalLinearInterpolation
+    seen: dict = eqx.field(static=True, default_factory=dict)
+
+    def order(self, terms):
+        return 1
+
+    def init(self, terms, t0, t1, y0, args):
+        self.seen["init"] = terms
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        self.seen.update(step=terms, made_jump=made_jump)
+        y1 = jax.tree.map(lambda y, f: y + (t1 - t0) * f, y0, terms.vf(t0, y0, args))
+        return y1, None, dict(y0=y0, y1=y1), None, dfx.RESULTS.successful
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+
+def record(recorder=None, **kwargs):
+    recorder = Recorder() if recorder is None else recorder
+    run = lambda: dfx.diffeqsolve(TERM, recorder, 0.0, -1.0, -0.1, Y0, **kwargs).ys
+    eqx.filter_eval_shape(run)
+    return recorder.seen
+
+
+@pytest.mark.parametrize("call", ["init", "step"])
+def test_the_term_arrives_in_a_wrapper_with_term_and_direction(call):
+    wrapped = record()[call]
+    assert not isinstance(wrapped, dps.HamiltonianTerm) and isinstance(
+        getattr(wrapped, "term", None), dps.HamiltonianTerm
+    ), "`diffeqsolve` no longer hands a solver its term in a wrapper with `.term`."
+    assert eqx.is_array(getattr(wrapped, "direction", None)), (
+        "The wrapper of a term no longer has `.direction`, the sign of time."
+    )
+
+
+@pytest.mark.parametrize("t1, sign", [(1.0, 1), (-1.0, -1)])
+def test_direction_is_the_sign_of_time(t1, sign):
+    class Compass(Recorder):
+        def step(self, terms, t0, t1, y0, *args):
+            _, *rest = super().step(terms, t0, t1, y0, *args)
+            return (terms.direction * jnp.ones(1), jnp.abs(t1) * jnp.ones(1)), *rest
+
+    sol = dfx.diffeqsolve(TERM, Compass(), 0.0, t1, sign * 0.25, Y0)
+    assert sol.ys is not None
+    direction, end = sol.ys
+    assert direction == sign and end == abs(t1), (
+        "The wrapper's `.direction` is no longer 1 or -1, by which time is multiplied."
+    )
+
+
+def test_made_jump_is_false_under_constant_step_sizes():
+    assert record()["made_jump"] is False, (
+        "`made_jump` is no longer the Python value `False` under `ConstantStepSize`: a "
+        "branch is traced, and the carried force kept for nothing."
+    )
+
+
+def test_made_jump_is_traced_under_controllers_that_jump():
+    controller = dfx.ClipStepSizeController(
+        dfx.PIDController(rtol=1.0, atol=1.0), jump_ts=jnp.array([-0.5])
+    )
+
+    class Estimating(Recorder):
+        def step(self, *args):
+            y1, _, dense, state, result = super().step(*args)
+            return y1, jax.tree.map(jnp.zeros_like, y1), dense, state, result
+
+    seen = record(Estimating(), stepsize_controller=controller)
+    assert isinstance(seen["made_jump"], Tracer), (
+        "`made_jump` is no longer an array under `ClipStepSizeController`."
+    )
+
+
+def test_the_term_of_backsolve_adjoint_is_called_adjoint_term():
+    recorder = Recorder()
+
+    @jax.grad
+    def gradient(y0):
+        adjoint = dfx.BacksolveAdjoint(solver=recorder)
+        sol = dfx.diffeqsolve(TERM, dfx.Euler(), 0.0, 1.0, 0.1, y0, adjoint=adjoint)
+        assert sol.ys is not None
+        return jnp.sum(sol.ys[0])
+
+    eqx.filter_eval_shape(gradient, Y0)
+    inner = getattr(recorder.seen["init"], "term", recorder.seen["init"])
+    assert type(inner).__name__ == "AdjointTerm", (
+        "`BacksolveAdjoint` no longer solves an `AdjointTerm`, by whose name its users "
+        "are told what to write instead."
+    )
