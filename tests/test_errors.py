@@ -15,7 +15,7 @@ import lineax as lx
 import numpy as np
 import optimistix as optx
 import pytest
-from helpers import each, harmonic, mixed_energy, oscillator, Scheme
+from helpers import assert_close, each, harmonic, mixed_energy, oscillator, Scheme
 
 import diffrax_presym as dps
 
@@ -54,6 +54,10 @@ class Mistake(NamedTuple):
         message = str(error.value)
         for part in self:
             assert part in message
+
+
+def splitting(*fractions, order=2, kick_first=True):
+    return dps.Splitting(dps.SplittingTableau(order, kick_first, False, fractions))
 
 
 def mistakes(cases):
@@ -179,7 +183,28 @@ def test_backsolve_adjoint_with_the_same_solver():
     Mistake("`BacksolveAdjoint()`", "not Hamiltonian", instead).check(error)
 
 
+def test_backsolve_adjoint_with_the_solver_it_is_told_to_use():
+    @eqx.filter_jit
+    def gradient(adjoint):
+        def loss(y0):
+            t0, t1, dt0 = jnp.array(0.0), jnp.array(1.0), jnp.array(0.01)
+            sol = dfx.diffeqsolve(TERM, LEAPFROG, t0, t1, dt0, y0, adjoint=adjoint)
+            assert sol.ys is not None
+            return jnp.sum(sol.ys[0] ** 2 + sol.ys[1])
+
+        return jax.grad(loss)(PAIR)
+
+    backsolve = gradient(dfx.BacksolveAdjoint(solver=dfx.Tsit5()))
+    # To the error of the leapfrog, as the adjoint equations are not those of its steps.
+    assert_close(backsolve, gradient(dfx.RecursiveCheckpointAdjoint()), 1e-4)
+
+
 # Energies that a scheme cannot step
+
+PARTS = (
+    "`SeparableHamiltonian(kinetic, potential)`",
+    "`ConformalHamiltonian(kinetic, potential, damping)`",
+)
 
 
 @pytest.mark.parametrize("hamiltonian", list(NONSEPARABLE.values()), ids=NONSEPARABLE)
@@ -192,25 +217,44 @@ def test_nonseparable_energies_need_a_root_finder(scheme: Scheme, hamiltonian):
     # All three ways out.
     assert "`root_finder=optimistix.Newton(rtol=1e-10, atol=1e-10)`" in message
     assert "`PresymplecticTao()`" in message
-    assert "`SeparableHamiltonian`" in message
+    assert all(parts in message for parts in PARTS)
 
 
 SPLIT = "a Hamiltonian split into a kinetic part and a potential"
 
 
-@pytest.mark.parametrize("solver", [dps.BlanesMoan4(), dps.BlanesMoanRKN4()])
-def test_splittings_need_a_split_energy(solver):
+@pytest.mark.parametrize("hamiltonian", list(NONSEPARABLE.values()), ids=NONSEPARABLE)
+@pytest.mark.parametrize(
+    "solver",
+    [dps.BlanesMoan4(), dps.BlanesMoanRKN4(), dps.Splitting(dps.BlanesMoan6.tableau)],
+)
+def test_splittings_need_a_split_energy(solver, hamiltonian):
     with pytest.raises(ValueError) as error:
-        trace(dps.HamiltonianTerm(NONSEPARABLE["undamped"]), solver)
-    Mistake("this `Hamiltonian` is not", SPLIT, "`PresymplecticTao()`").check(error)
+        trace(dps.HamiltonianTerm(hamiltonian), solver)
+    given = f"this `{type(hamiltonian).__name__}` is not"
+    Mistake(given, SPLIT, "`PresymplecticTao()`").check(error)
+    assert all(parts in str(error.value) for parts in PARTS)
 
 
-def test_nystroem_splittings_need_a_quadratic_kinetic_energy():
-    hamiltonian = dps.SeparableHamiltonian(dps.RelativisticKinetic(), harmonic)
+@pytest.mark.parametrize(
+    "hamiltonian",
+    [
+        dps.SeparableHamiltonian(dps.RelativisticKinetic(), harmonic),
+        dps.SeparableHamiltonian(lambda t, p, args: jnp.sum(p**2) / 2, harmonic),
+        dps.SeparableHamiltonian(KINETIC, harmonic, velocity=lambda t, p, args: p),
+        dps.VectorField(lambda t, p, args: p, lambda t, q, args: -q),
+    ],
+    ids=["relativistic", "a function", "velocity by hand", "no energy"],
+)
+@pytest.mark.parametrize(
+    "solver", [dps.BlanesMoanRKN4(), dps.BlanesMoanRKN6(), dps.BlanesCasasRKN8()]
+)
+def test_nystroem_splittings_need_a_quadratic_kinetic_energy(solver, hamiltonian):
     with pytest.raises(ValueError) as error:
-        trace(dps.HamiltonianTerm(hamiltonian), dps.BlanesMoanRKN4())
+        trace(dps.HamiltonianTerm(hamiltonian), solver)
     needed = "quadratic in the momentum, and known to be"
-    Mistake("`BlanesMoanRKN4`", needed, "`BlanesMoan4()`").check(error)
+    Mistake(f"`{type(solver).__name__}`", needed, "`BlanesMoan4()`").check(error)
+    assert "`QuadraticKinetic(mass)`" in str(error.value)
 
 
 @pytest.mark.parametrize("solver", [LEAPFROG, dps.PresymplecticTao()])
@@ -219,6 +263,9 @@ def test_step_sizes_by_error_estimate(solver):
     controller = dfx.PIDController(rtol=1e-3, atol=1e-3)
     with pytest.raises(RuntimeError, match="solver that does not provide error est"):
         trace(TERM, solver, stepsize_controller=controller)
+    # What to write instead is in the documentation of the solvers.
+    assert "`diffrax.HalfSolver`" in str(dps.AbstractPresymplecticSolver.__doc__)
+    trace(TERM, dfx.HalfSolver(solver), stepsize_controller=controller)
 
 
 # Solvers
@@ -228,6 +275,7 @@ ROOT_FINDER = "`root_finder` must be an Optimistix root finder"
 NEWTON = "`optimistix.Newton(rtol=1e-10, atol=1e-10)`"
 SYMMETRIC = "Compositions need a symmetric base"
 BASE = "`base` must be a presymplectic solver"
+TABLEAU = "needs drifts that sum to one and kicks that sum to one, by turns"
 SUM = "`weights` must sum to one"
 FIXED = "a coupling that does not change with the step"
 WITHOUT_TOLERANCES = dfx.with_stepsize_controller_tols(dfx.VeryChord)()
@@ -255,6 +303,37 @@ SOLVERS = {
     "no weights": (
         lambda: dps.Composition(LEAPFROG, []),
         Mistake("sum to 0.0", SUM, "divide by their sum"),
+    ),
+    "kicks of a tableau": (
+        lambda: splitting(0.5, 1.0, 0.25),
+        Mistake("2 kicks that sum to 0.75", TABLEAU, "divide each kind by its sum"),
+    ),
+    "drifts of a tableau": (
+        lambda: splitting(0.5, 1.0, 0.25, kick_first=False),
+        Mistake("2 drifts that sum to 0.75", TABLEAU, "divide each kind by its sum"),
+    ),
+    "tableau of a number that is none": (
+        lambda: splitting(0.5, float("nan"), 0.5),
+        Mistake("1 drifts that sum to nan", TABLEAU, "divide each kind by its sum"),
+    ),
+    "tableau of an even number of moves": (
+        lambda: splitting(0.5, 0.5, 0.5, 0.5),
+        Mistake("2 kicks that sum to 1.0 and 2", TABLEAU, "an odd number of moves"),
+    ),
+    **{
+        f"order {order!r} of a tableau": (
+            lambda order=order: splitting(0.5, 1.0, 0.5, order=order),  # type: ignore
+            Mistake(f"got {order!r}", "a positive integer", "`SplittingTableau(order="),
+        )
+        for order in (0, 2.0)
+    },
+    "tableau of another kind": (
+        lambda: dps.Splitting((0.5, 1.0, 0.5)),  # type: ignore
+        Mistake(
+            "got (0.5, 1.0, 0.5)",
+            "needs a tableau",
+            "`Splitting(SplittingTableau(order, kick_first, quadratic, fractions))`",
+        ),
     ),
     "base of a triple jump": (
         lambda: dps.SuzukiYoshida(4, base=dps.PresymplecticEuler()),
@@ -294,6 +373,10 @@ SOLVERS = {
     "coupling of another kind": (
         lambda: dps.PresymplecticTao("strong"),
         Mistake("'strong'", "a real number", "`PresymplecticTao(coupling)`"),
+    ),
+    "several couplings": (
+        lambda: trace(TERM, dps.PresymplecticTao(jnp.ones(2))),
+        Mistake("has shape (2,)", "must be one number", "`jax.vmap`"),
     ),
     **{
         f"first {given!r}": (
@@ -379,6 +462,14 @@ HAMILTONIANS = {
         lambda: system(dps.QuadraticKinetic(jnp.ones(3))),
         Mistake("of shape (3,)", "does not fit `p` of shape (2,)", "Pass a number, or"),
     ),
+    "matrix that is not positive": (
+        lambda: dps.QuadraticKinetic(jnp.array([[1.0, 2.0], [2.0, -1.0]])),
+        Mistake("got [ 1. -1.]", POSITIVE, f"The diagonal of {MASS}"),
+    ),
+    "column of masses": (
+        lambda: dps.QuadraticKinetic(jnp.array([[1.0], [-2.0]])),
+        Mistake("got [[ 1.]", POSITIVE, MASS),
+    ),
     "matrix of a wrong shape": (
         lambda: system(dps.QuadraticKinetic(jnp.eye(3))),
         Mistake("got shape (3, 3)", "for `p` of shape (2,)", "one row and column for"),
@@ -410,6 +501,18 @@ HAMILTONIANS = {
     "potential of many numbers": (
         lambda: system(potential=lambda t, q, args: q**2),
         Mistake("The potential", f"{ONE_NUMBER}, but returned float64[2]", SUM_OVER),
+    ),
+    "potential of integers": (
+        lambda: system(potential=lambda t, q, args: jnp.sum(q > 0)),
+        Mistake("returned int64[]", f"The potential {ONE_NUMBER}", "floating point"),
+    ),
+    "complex potential": (
+        lambda: system(potential=lambda t, q, args: jnp.sum(q) * jnp.array(1j)),
+        Mistake("returned complex128[]", f"The potential {ONE_NUMBER}", "`jnp.real`"),
+    ),
+    "potential of several numbers": (
+        lambda: system(potential=lambda t, q, args: (q[0], q[1])),
+        Mistake("returned (float64[], float64[])", ONE_NUMBER, SUM_OVER),
     ),
     "potential of none": (
         lambda: system(potential=lambda t, q, args: None),
@@ -446,6 +549,37 @@ HAMILTONIANS = {
         lambda: system(force=lambda t, q, args: (q, q)),
         Mistake("returned PyTreeDef((*, *))", "the same structure as `q`", "`force`"),
     ),
+    "complex force": (
+        lambda: system(force=lambda t, q, args: q * jnp.array(1j)),
+        Mistake("`force` must return real", "returned complex128[2]", "`jnp.real`"),
+    ),
+    "velocity of a wrong structure": (
+        lambda: system(velocity=lambda t, p, args: {"v": p}),
+        Mistake("returned PyTreeDef({'v': *})", "structure as `p`", "`velocity`"),
+    ),
+    **{
+        f"{name} of an energy that is not separable": (
+            lambda name=name: trace(
+                dps.HamiltonianTerm(
+                    dps.Hamiltonian(
+                        mixed_energy, **{name: lambda t, q, p, args: jnp.ones(3)}
+                    )
+                ),
+                dps.PresymplecticTao(),
+            ),
+            Mistake("returned shape (3,)", f"`{name}` must return", "of shape (2,)"),
+        )
+        for name in ("velocity", "force")
+    },
+    "force of a hand-written field": (
+        lambda: trace(
+            dps.HamiltonianTerm(
+                dps.VectorField(lambda t, p, a: p, lambda t, q, a: jnp.ones(3))
+            ),
+            LEAPFROG,
+        ),
+        Mistake("returned shape (3,)", "`force` must return", "of shape (2,)"),
+    ),
     "velocity of a wrong shape": (
         lambda: system(velocity=lambda t, p, args: jnp.ones(3)),
         Mistake("returned shape (3,)", "arrays of the shapes of `p`", "of shape (2,)"),
@@ -473,6 +607,42 @@ HAMILTONIANS = {
     "neither energy": (
         lambda: dps.ConformalHamiltonian(damping=DAMPING),
         Mistake("needs", EITHER, "`ConformalHamiltonian(kinetic, potential, damping)`"),
+    ),
+    "half an energy": (
+        lambda: dps.ConformalHamiltonian(KINETIC, damping=DAMPING),
+        Mistake("needs", EITHER, "`ConformalHamiltonian(energy=energy, damping=damp"),
+    ),
+    "energy and damping by position": (
+        lambda: dps.ConformalHamiltonian(mixed_energy, DAMPING),
+        Mistake(
+            "got ConstantDamping(",
+            "`potential` must be a function `V(t, q, args)`",
+            "`ConformalHamiltonian(energy=energy, damping=damping)`",
+        ),
+    ),
+    "potential before kinetic energy": (
+        lambda: dps.SeparableHamiltonian(harmonic, KINETIC),
+        Mistake(
+            "got QuadraticKinetic(",
+            "`potential` must be a function `V(t, q, args)`",
+            "The order is `(kinetic, potential, damping)`",
+        ),
+    ),
+    "kinetic energy of `p` alone said to depend on `q`": (
+        lambda: dps.DissipativeHamiltonian(
+            KINETIC, harmonic, DAMPING, DAMPING, separable=False
+        ),
+        Mistake(
+            "got QuadraticKinetic(",
+            "`DissipativeHamiltonian(..., separable=False)` needs",
+            "a function `T(t, q, P, args)`",
+        ),
+    ),
+    "potential of the general family is no function": (
+        lambda: dps.DissipativeHamiltonian(
+            lambda t, q, P, args: jnp.sum(P**2), 3.0, DAMPING, DAMPING, separable=False
+        ),
+        Mistake("got 3.0", "`potential` must be a function", "`V(t, q, args)`"),
     ),
     "both energies": (
         lambda: dps.ConformalHamiltonian(KINETIC, harmonic, energy=mixed_energy),
@@ -516,3 +686,69 @@ def test_one_damping_for_all_momenta(law, solver):
 def test_masses_not_yet_known_are_not_judged():
     mass = eqx.filter_eval_shape(dps.QuadraticKinetic, jnp.array(-1.0)).mass
     assert mass.shape == ()
+
+
+# A root that is not found is a result, not a number as if nothing had happened.
+
+NOT_FOUND = "maximum number of steps was reached in the nonlinear solver"
+
+
+def hard_energy(t, q, p, args):
+    """Not separable, but linear for a root finder except from one time to another."""
+    start, end = args
+    hard = jnp.where((t >= start) & (t <= end), 1.0, 0.0)
+    return jnp.sum(q**2 + p**2) / 2 + hard * mixed_energy(t, q, p, None)
+
+
+HARD = dps.HamiltonianTerm(dps.Hamiltonian(hard_energy))
+START = (jnp.array([0.7, -0.3]), jnp.array([0.4, 0.9]))
+
+
+@eqx.filter_jit
+def find(solver, window, throw=False):
+    t0, t1, dt0 = jnp.array(0.0), jnp.array(1.0), jnp.array(0.25)
+    return dfx.diffeqsolve(HARD, solver, t0, t1, dt0, START, window, throw=throw)
+
+
+def window(start, end):
+    return jnp.array(start), jnp.array(end)
+
+
+# Two steps of Newton's method solve a linear equation, and make sure of it.
+FINDER, STEPS = optx.Newton(rtol=1e-10, atol=1e-10), 2
+LEAPFROG_AB = dps.PresymplecticLeapfrog("momentum", FINDER, STEPS)
+LEAPFROG_BA = dps.PresymplecticLeapfrog("position", FINDER, STEPS)
+# And times at which alone a root cannot be found.
+UNSOLVED = {
+    "euler_A": (dps.PresymplecticEuler("momentum", FINDER, STEPS), (0.0, 0.5)),
+    "euler_B": (dps.PresymplecticEuler("position", FINDER, STEPS), (0.5, 1.0)),
+    # The first of a step or the last of one.
+    "leapfrog_AB": (LEAPFROG_AB, (0.0, 1.0)),
+    "leapfrog_BA": (LEAPFROG_BA, (0.125, 0.875)),
+    # The first of all stages or the last.
+    "suzuki_yoshida": (dps.SuzukiYoshida(4, base=LEAPFROG_AB), (0.0, 1.0)),
+    "substeps": (dps.Substeps(LEAPFROG_AB, 2), (0.0, 1.0)),
+}
+
+
+@pytest.mark.parametrize("name", UNSOLVED)
+def test_roots_that_are_not_found_are_a_result(name):
+    solver, times = UNSOLVED[name]
+    assert find(solver, window(2.0, 2.0)).result == dfx.RESULTS.successful
+    for t in times:
+        sol = find(solver, window(t - 0.01, t + 0.01))
+        assert sol.result != dfx.RESULTS.successful
+        assert NOT_FOUND in dfx.RESULTS[sol.result]
+
+
+@pytest.mark.parametrize("name", ["euler_A", "leapfrog_AB", "suzuki_yoshida"])
+def test_roots_that_are_not_found_are_an_error(name):
+    solver, times = UNSOLVED[name]
+    with pytest.raises(RuntimeError, match=NOT_FOUND):
+        find(solver, window(times[0], times[0]), throw=True)
+
+
+def test_tolerances_that_cannot_be_met_are_a_result():
+    solver = dps.PresymplecticLeapfrog("position", optx.Newton(rtol=0.0, atol=0.0))
+    sol = find(solver, window(0.0, 1.0))
+    assert sol.result != dfx.RESULTS.successful
