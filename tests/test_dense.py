@@ -1,0 +1,146 @@
+"""Dense output: as accurate between the steps as the scheme is at their ends."""
+
+import functools
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, flat, pendulum, solve
+
+import diffrax_presym as dps
+
+
+SYSTEM = dps.DissipativeHamiltonian(
+    dps.QuadraticKinetic(2.0),
+    pendulum,
+    eta1=dps.ConstantDamping(0.1),
+    eta2=dps.LogDamping(1.0, shift=1.0),
+)
+Y0 = (jnp.array([1.0, 0.5]), jnp.array([0.3, -0.7]))
+T1 = 3.0
+TS = jnp.linspace(0, T1, 58)
+
+# Each with the order of its dense output.
+SOLVERS = {
+    "leapfrog": (dps.PresymplecticLeapfrog(), 2),
+    "leapfrog, position first": (dps.PresymplecticLeapfrog("position"), 2),
+    "Yoshida 4": (dps.PresymplecticYoshida4(), 4),
+    "BlanesMoan4": (dps.BlanesMoan4(), 4),
+    "BlanesMoanRKN4": (dps.BlanesMoanRKN4(), 4),
+    "BlanesMoanRKN6": (dps.BlanesMoanRKN6(), 6),
+    "BlanesMoan6": (dps.BlanesMoan6(), 6),
+    "SofroniouSpaletta8": (dps.SofroniouSpaletta8(), 6),
+    "Tao": (dps.PresymplecticTao(5.0), 2),
+}
+
+
+@functools.cache
+def exact():
+    saveat = dfx.SaveAt(ts=TS)
+    controller = dfx.StepTo(jnp.linspace(0, T1, 57 * 40 + 1))
+    sol = dfx.diffeqsolve(
+        dps.HamiltonianTerm(SYSTEM),
+        dfx.Dopri8(),
+        t0=0.0,
+        t1=T1,
+        dt0=None,
+        y0=Y0,
+        saveat=saveat,
+        stepsize_controller=controller,
+    )
+    return jax.tree.map(np.asarray, sol.ys)
+
+
+@pytest.mark.parametrize("half", ["q", "p"])
+@pytest.mark.parametrize("name", SOLVERS)
+def test_order_between_the_steps(name, half):
+    solver, order = SOLVERS[name]
+    which = "qp".index(half)
+    errors = []
+    for h in (0.15, 0.075):
+        ys = solve(SYSTEM, solver, 0.0, T1, h, Y0, saveat=dfx.SaveAt(ts=TS)).ys
+        error = jax.tree.map(lambda y, e: np.max(np.abs(y - e)), ys, exact())
+        errors.append(error[which])
+    assert abs(np.log2(errors[0] / errors[1]) - order) < 0.3
+
+
+def dense(solver, dt0=0.3, **kwargs):
+    saveat = dfx.SaveAt(t0=True, steps=True, dense=True)
+    return solve(
+        SYSTEM, solver, 0.0, T1, dt0, Y0, saveat=saveat, max_steps=10, **kwargs
+    )
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_dense_output_is_exact_at_the_steps(name):
+    sol = dense(SOLVERS[name][0])
+    steps = np.asarray(sol.ts)
+    for i, t in enumerate(steps[steps < np.inf]):
+        at = sol.evaluate(jnp.asarray(t))
+        assert_close(at, jax.tree.map(lambda y, i=i: y[i], sol.ys), 1e-15)
+
+
+@pytest.mark.parametrize("name", ["Yoshida 4", "BlanesMoanRKN6"])
+def test_derivative_is_the_vector_field(name):
+    sol, t = dense(SOLVERS[name][0]), jnp.array(1.1)
+    slope = dps.HamiltonianTerm(SYSTEM).vf(t, sol.evaluate(t), None)
+    assert_close(sol.derivative(t), slope, 2e-3 if name == "Yoshida 4" else 2e-6)
+
+
+def test_differences_within_a_step():
+    # Of a whole solution Diffrax can take them only if the state is one array.
+    term, solver = dps.HamiltonianTerm(SYSTEM), dps.BlanesMoanRKN6()
+    t0, t1 = jnp.array(0.0), jnp.array(0.3)
+    carry = solver.init(term, t0, t1, Y0, None)
+    _, _, info, _, _ = solver.step(term, t0, t1, Y0, None, carry, made_jump=False)
+    step = dps.HermiteInterpolation(t0=t0, t1=t1, **info)
+    difference = jax.tree.map(jnp.subtract, step.evaluate(0.2), step.evaluate(0.1))
+    assert_close(step.evaluate(0.1, 0.2), difference, 1e-15)
+
+
+def test_dense_output_backwards_in_time():
+    solver = dps.BlanesMoanRKN6()
+    saveat = dfx.SaveAt(dense=True)
+    end = jax.tree.map(lambda y: y[-1], exact())
+    sol = solve(SYSTEM, solver, T1, 0.0, -0.1, end, saveat=saveat, max_steps=30)
+    for i in (10, 31, 50):
+        expected = jax.tree.map(lambda y, i=i: y[i], exact())
+        assert_close(sol.evaluate(TS[i]), expected, 1e-7)
+
+
+@pytest.mark.parametrize("name", ["leapfrog", "BlanesMoanRKN6", "Tao"])
+def test_an_empty_solve_is_its_start(name):
+    t = jnp.array(0.5)
+    saveat = dfx.SaveAt(t0=True, t1=True, ts=jnp.array([0.5, 0.5]), dense=True)
+    sol = solve(SYSTEM, SOLVERS[name][0], t, t, 0.1, Y0, saveat=saveat, max_steps=4)
+    expected = flat(Y0)
+    assert_close(sol.evaluate(t), Y0, 0.0)
+    for i in range(4):
+        saved = jax.tree.map(lambda y, i=i: y[i], sol.ys)
+        assert np.array_equal(flat(saved), expected)
+
+
+def test_dense_output_under_vmap():
+    solver = dps.BlanesMoanRKN4()
+    scales = jnp.array([0.5, 1.0, 1.5])
+
+    def at(scale, t):
+        y0 = jax.tree.map(lambda y: scale * y, Y0)
+        sol = dfx.diffeqsolve(
+            dps.HamiltonianTerm(SYSTEM),
+            solver,
+            t0=0.0,
+            t1=T1,
+            dt0=0.3,
+            y0=y0,
+            saveat=dfx.SaveAt(dense=True),
+            max_steps=10,
+        )
+        return sol.evaluate(t)
+
+    t = jnp.array(1.23)
+    batch = jax.vmap(at, in_axes=(0, None))(scales, t)
+    for i, scale in enumerate(scales):
+        assert_close(jax.tree.map(lambda y, i=i: y[i], batch), at(scale, t), 1e-14)
