@@ -115,3 +115,66 @@ def test_the_term_of_backsolve_adjoint_is_called_adjoint_term():
         "`BacksolveAdjoint` no longer solves an `AdjointTerm`, by whose name its users "
         "are told what to write instead."
     )
+
+
+class Interpolation(dfx.AbstractLocalInterpolation):
+    """One that takes whatever it is given, and writes it down."""
+
+    t0: jax.Array
+    t1: jax.Array
+    given: dict
+
+    def __init__(self, *args, **kwargs):
+        Interpolating.built.append((args, kwargs))
+        self.t0, self.t1, self.given = kwargs["t0"], kwargs["t1"], kwargs
+
+    def evaluate(self, t0, t1=None, left=True):
+        return self.given["y1"]
+
+
+class Interpolating(Recorder):
+    interpolation_cls: ClassVar = Interpolation
+    built: ClassVar[list] = []
+
+
+# Within the loop, and by what a solution of dense output does after it.
+@pytest.mark.parametrize("saveat", [dict(ts=jnp.array([-0.5])), dict(dense=True)])
+def test_interpolations_are_made_of_times_and_dense_info(saveat):
+    Interpolating.built.clear()
+
+    def run():
+        saved = dfx.SaveAt(**saveat)
+        sol = dfx.diffeqsolve(TERM, Interpolating(), 0.0, -1.0, -0.1, Y0, saveat=saved)
+        return sol.evaluate(-0.5) if saved.dense else sol.ys
+
+    eqx.filter_eval_shape(run)
+    assert Interpolating.built, "`interpolation_cls` is no longer what is called."
+    for args, kwargs in Interpolating.built:
+        assert not args and set(kwargs) == {"t0", "t1", "y0", "y1"}, (
+            "`interpolation_cls` is no longer called with `t0`, `t1` and the entries "
+            "of `dense_info`, all by name."
+        )
+
+
+@pytest.mark.parametrize("call", ["init", "step"])
+def test_times_are_arrays_of_one_precision(call):
+    times = []
+
+    class Clock(Recorder):
+        def init(self, terms, t0, t1, y0, args):
+            times.extend((t0, t1) if call == "init" else ())
+
+        def step(self, terms, t0, t1, *args):
+            times.extend((t0, t1) if call == "step" else ())
+            return super().step(terms, t0, t1, *args)
+
+    # Of Python numbers of several kinds, an integer too.
+    run = lambda: dfx.diffeqsolve(TERM, Clock(), 0, 1.0, 0.1, Y0).ys
+    eqx.filter_eval_shape(run)
+    assert times and all(isinstance(t, jax.Array) for t in times), (
+        "A solver is no longer given times that are arrays: Python numbers would be "
+        "upcast, and have no `.dtype`."
+    )
+    assert {(t.shape, t.dtype) for t in times} == {((), jnp.dtype("float64"))}, (
+        "A solver is no longer given times of one floating precision."
+    )
