@@ -1,0 +1,87 @@
+"""Ensembles split over devices and processes: equal results, and no communication."""
+
+import contextlib
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+
+import pytest
+
+
+EXAMPLE = pathlib.Path(__file__).parent.parent / "examples" / "ensemble.py"
+FREE = {"constant steps", "adaptive steps, in shard_map", "an event, in shard_map"}
+IN_EACH_STEP = {"constant steps, an event", "adaptive steps"}
+
+
+def run(tmp_path, *options, limit):
+    """The example's output; it and its children are ended whatever happens."""
+    # How this process runs JAX is no concern of the example.
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("XLA_")}
+    environment |= {"JAX_PLATFORMS": "cpu", "MPLBACKEND": "Agg"}
+    command = [sys.executable, str(EXAMPLE), "--quick", "--timeout", str(limit - 20)]
+    process = subprocess.Popen(
+        [*command, *options],
+        cwd=tmp_path,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        output, errors = process.communicate(timeout=limit)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    assert process.returncode == 0, errors
+    assert (tmp_path / "ensemble.png").stat().st_size > 0
+    return output
+
+
+def reports(output):
+    """What each process says of its part: `(difference, communication)`."""
+    lines = [line for line in output.splitlines() if line.startswith("process ")]
+    found = []
+    for line in sorted(lines):
+        _, equality, communication = line.split(";")
+        verdict = equality.rpartition(": ")[2]
+        difference = 0.0 if verdict == "bitwise equal" else float(verdict.split()[-1])
+        found.append((difference, communication.rpartition(": ")[2]))
+    return found
+
+
+@pytest.mark.slow
+def test_over_devices(tmp_path):
+    output = run(tmp_path, "--devices", "8", limit=200)
+    assert "over 8 x cpu in 1 process(es), 512 on each device" in output
+    ((difference, communication),) = reports(output)
+    # Bitwise as measured; compilers may round the remainder of a vector otherwise.
+    assert difference < 1e-9
+    assert communication == "none"
+    table = output.split("Communication in the compiled program")[1]
+    rows = {line[2:36].strip(): line[36:] for line in table.splitlines()[1:]}
+    assert {name for name in rows if rows[name] == "none"} >= FREE
+    # The search for such operations finds them where they must be.
+    assert {name for name in rows if "in each step" in rows[name]} == IN_EACH_STEP
+
+
+@pytest.mark.slow
+def test_over_processes(tmp_path):
+    output = run(tmp_path, "--processes", "2", limit=200)
+    assert "over 2 x cpu in 2 process(es), 2048 on each device" in output
+    found = reports(output)
+    assert len(found) == 2
+    for difference, communication in found:
+        assert difference < 1e-9
+        assert communication == "none"
+
+
+@pytest.mark.slow
+def test_processes_end_at_the_limit(tmp_path):
+    command = [sys.executable, str(EXAMPLE), "--processes", "2", "--timeout", "1"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, timeout=60)
+    assert done.returncode == 1
+    assert not list(tmp_path.iterdir())
