@@ -237,10 +237,11 @@ def _expm1_ratio(x: Scalar) -> Scalar:
 
 
 def _series(x: Scalar) -> Scalar:
-    return jnp.polyval(cast_to(_COEFFICIENTS, x), x)
-
-
-_COEFFICIENTS = np.array([1 / math.factorial(k) for k in range(10, 0, -1)])
+    # Horner's rule; `jnp.polyval` would be a loop.
+    value = 1 / math.factorial(10)
+    for k in range(9, 0, -1):
+        value = value * x + 1 / math.factorial(k)
+    return jnp.asarray(value)
 
 
 def as_damping(damping, name: str) -> AbstractDamping:
