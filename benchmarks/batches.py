@@ -5,15 +5,18 @@ are tuned, so that every method has the same error: the largest over the first s
 points, of which the first is the hardest, relative to the largest entry of the
 solution, against tiny steps of Dopri8. The error beside each time is the largest over
 the batch, or its first 4096 members. Everything runs in one process, compiled and
-warmed up, by turns; a number is the median. Where the time for one smaller batch says
-that a solve would take too long, it is left out.
+warmed up, by turns; a number is the median, or one run if that takes seconds. Where the
+time for a smaller batch says that a solve would take too long, and where it would take
+more than a million steps, it is left out.
 
 The second table is a batch of 1024 with what else matters on a CPU: the sine, which XLA
 evaluates one by one in double precision, written as a polynomial; and the batch cut
-into blocks that fit the cache, `jax.lax.map(solve, y0, batch_size=512)`. heyoka is
+into blocks, `jax.lax.map(solve, y0, batch_size=512)`, too small for XLA to spread each
+operation over threads, which costs more than it gains at this size. heyoka is
 measured if it is installed, as it is used for many trajectories: one after the other,
-and as many at a time as the processor has lanes. It runs on one core; the column
-`cores` says how many a method had busy.
+and as many at a time as the processor has lanes. It runs on one core, where XLA may use
+all, so the second column is the time of all cores together: also the steadier of the
+two on a machine with other work.
 """
 
 import argparse
@@ -41,6 +44,7 @@ SIZES = (1, 64, 4096, 262144)
 TARGETS = (1e-6, 1e-9)
 BLOCK = 512
 CHECKED = 4096
+MOST_STEPS = 1e6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,6 +146,8 @@ def tune(solve, method, target, errors):
     y0 = starts(64)
     x, good = (target if method.adaptive else 300.0), None
     for _ in range(8):
+        if x > MOST_STEPS:
+            return None
         error = errors.of(solve(y0, jnp.asarray(x)))
         if not math.isfinite(error):
             error = 1.0
@@ -158,21 +164,30 @@ def tune(solve, method, target, errors):
     return good
 
 
-def timed(fn):
-    """Seconds, and how many cores were busy."""
+def timed(call):
+    """The result, the seconds, and the seconds of all cores together."""
     cpu, start = time.process_time(), time.perf_counter()
-    jax.block_until_ready(fn())
-    seconds = time.perf_counter() - start
-    return seconds, (time.process_time() - cpu) / seconds
+    result = jax.block_until_ready(call())
+    return result, time.perf_counter() - start, time.process_time() - cpu
 
 
 def by_turns(calls, repeats):
-    """The median `(seconds, cores)` of each call."""
-    for call in calls:
-        call()
-    rounds = [[timed(call) for call in calls] for _ in range(repeats)]
-    median = lambda pairs: tuple(map(statistics.median, zip(*pairs, strict=True)))
-    return [median(pairs) for pairs in zip(*rounds, strict=True)]
+    """For each call its result, and the medians of both times."""
+    rounds = [[timed(call) for call in calls.values()] for _ in range(repeats)]
+    results = {}
+    for name, of_one in zip(calls, zip(*rounds, strict=True), strict=True):
+        (*_, y), seconds, cores = zip(*of_one, strict=True)
+        results[name] = y, statistics.median(seconds), statistics.median(cores)
+    return results
+
+
+def program(solve, y0, x, warm=True):
+    """A compiled solve, called once before it counts."""
+    compiled = solve.lower(y0, jnp.asarray(x)).compile()
+    call = lambda: compiled(y0, jnp.asarray(x))
+    if warm:
+        jax.block_until_ready(call())
+    return call
 
 
 def scaling(tuned, methods, sizes, repeats, longest, errors):
@@ -185,22 +200,22 @@ def scaling(tuned, methods, sizes, repeats, longest, errors):
         rates = dict.fromkeys(cells, 0.0)
         last = dict.fromkeys(cells, 0.0)
         for n in sizes:
-            y0, calls = starts(n), {}
+            y0 = starts(n)
+            short, long = {}, {}
             for method in methods:
                 solve, x = tuned[method.name, target]
-                # Time is bounded by that of the last batch, scaled up.
-                if x is not None and last[method.name] * n < longest:
-                    calls[method.name] = lambda s=solve, x=x, y0=y0: s(
-                        y0, jnp.asarray(x)
-                    )
-            # One is enough where noise has time to average out.
-            times = by_turns([*calls.values()], 1 if n > 10_000 else repeats)
-            for (name, call), (seconds, _) in zip(calls.items(), times, strict=True):
+                expected = last[method.name] * n
+                if x is not None and expected < longest:
+                    # One run is enough where noise has time to average out.
+                    group = short if expected < 1 else long
+                    group[method.name] = program(solve, y0, x, warm=group is short)
+            found = by_turns(short, repeats) | by_turns(long, 1)
+            for name, (y, seconds, _) in found.items():
                 each = seconds / n
                 last[name] = each if n >= 64 else 0.0
                 rates[name] = max(rates[name], 1 / each)
-                cells[name].append(f"{each * 1e6:>10.1f} {errors.of(call()):.0e}")
-            for name in cells.keys() - calls.keys():
+                cells[name].append(f"{each * 1e6:>10.1f} {errors.of(y):.0e}")
+            for name in cells.keys() - found.keys():
                 cells[name].append("-")
         print(f"error {target:.0e}")
         for name, row in cells.items():
@@ -257,7 +272,7 @@ def heyoka_runs(n, errors):
             tolerances = [target * 10 ** (-k / 2) for k in range(7)]
             solves = [make(tolerance) for tolerance in tolerances]
             reach = [s for s in solves if errors.of(s()) <= target]
-            fastest = min(reach, key=lambda s: timed(s)[0])
+            fastest = min(reach, key=lambda s: timed(s)[1])
             runs[name, target] = fastest
     return runs
 
@@ -274,41 +289,47 @@ def beside_heyoka(tuned, methods, n, repeats, errors):
                 for target in TARGETS:
                     _, x = tuned[method.name, target]
                     if x is not None:
-                        call = lambda s=solve, x=x: s(y0, jnp.asarray(x))
-                        calls[f"{method.name:20} {how}", target] = call
+                        key = f"{method.name:20} {how}", target
+                        calls[key] = program(solve, y0, x)
     calls |= heyoka_runs(n, errors)
-    times = dict(zip(calls, by_turns([*calls.values()], repeats), strict=True))
-    print(f"\nA batch of {n}: microseconds per trajectory, error, cores busy")
+    found = by_turns(calls, repeats)
+    print(f"\nA batch of {n}: microseconds per trajectory, of all cores, and error")
     print(f"{'':46}" + "".join(f"{f'error {t:.0e}':>24}" for t in TARGETS))
     for name in dict.fromkeys(name for name, _ in calls):
         row = ""
         for target in TARGETS:
             cell = "-"
-            if (name, target) in calls:
-                seconds, cores = times[name, target]
-                error = errors.of(calls[name, target]())
-                cell = f"{seconds / n * 1e6:.1f} {error:.0e} {cores:>4.1f}"
+            if (name, target) in found:
+                y, *times = found[name, target]
+                us = [t / n * 1e6 for t in times]
+                cell = f"{us[0]:.1f} {us[1]:>7.1f} {errors.of(y):.0e}"
             row += f"{cell:>24}"
         print(f"{name:46}{row}")
+    print("\nThe best of each over our best: in time (in time of all cores)")
+    rivals = {"Diffrax": names(DIFFRAX)}
+    rivals |= {name: name for name, _ in calls if name.startswith("heyoka")}
     for target in TARGETS:
         for sine in sines:
-            ours = best(times, target, names(OURS), sine)
-            ratios = {"Diffrax": best(times, target, names(DIFFRAX), sine)}
-            for name in dict.fromkeys(name for name, _ in times):
-                if name.startswith("heyoka"):
-                    ratios[name] = best(times, target, name)
-            row = ", ".join(f"{x / ours:.1f} {name}" for name, x in ratios.items())
-            print(f"Best of each over our best at {target:.0e}, {sine}: {row}")
+            row = []
+            for rival, start in rivals.items():
+                share = sine if rival == "Diffrax" else ""
+                time, cores = (
+                    best(found, target, start, share, clock)
+                    / best(found, target, names(OURS), sine, clock)
+                    for clock in (1, 2)
+                )
+                row.append(f"{rival} {time:.1f} ({cores:.1f})")
+            print(f"  at {target:.0e}, {sine}: " + ", ".join(row))
 
 
 def names(methods):
     return tuple(method.name for method in methods)
 
 
-def best(times, target, start, contains=""):
+def best(found, target, start, contains, clock):
     return min(
-        seconds
-        for (name, t), (seconds, _) in times.items()
+        result[clock]
+        for (name, t), result in found.items()
         if t == target and name.startswith(start) and contains in name
     )
 
@@ -322,7 +343,7 @@ def main():
     options = parser.parse_args()
     quick = options.quick
     repeats = 1 if quick else 5
-    longest = options.longest or (0.3 if quick else 8.0)
+    longest = options.longest or (0.3 if quick else 12.0)
     sizes = (1, 64, 256) if quick else SIZES
     print(f"{jax.devices()[0].device_kind}, median of {repeats} runs")
     errors = Errors(min(max(sizes), CHECKED))
@@ -333,7 +354,7 @@ def main():
         for target in TARGETS:
             tuned[method.name, target] = solve, tune(solve, method, target, errors)
     scaling(tuned, methods, sizes, repeats, longest, errors)
-    few = [m for m in methods if m in OURS[1:] + DIFFRAX[2:]]
+    few = [m for m in methods if m in OURS[2:] + DIFFRAX[3:]]
     beside_heyoka(tuned, few, sizes[-1] if quick else 1024, repeats, errors)
 
 
