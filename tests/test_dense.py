@@ -3,11 +3,12 @@
 import functools
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, flat, pendulum, solve
+from helpers import assert_close, each, flat, pendulum, Scheme, solve
 
 import diffrax_presym as dps
 
@@ -144,3 +145,79 @@ def test_dense_output_under_vmap():
     batch = jax.vmap(at, in_axes=(0, None))(scales, t)
     for i, scale in enumerate(scales):
         assert_close(jax.tree.map(lambda y, i=i: y[i], batch), at(scale, t), 1e-14)
+
+
+# What holds for every scheme, and in both directions of time.
+
+
+@eqx.filter_jit
+def at_the_steps(sol):
+    """Value and slope there, and what the slope should be."""
+    term = dps.HamiltonianTerm(SYSTEM)
+    expected = jax.vmap(lambda t, y: term.vf(t, y, None))(sol.ts, sol.ys)
+    return jax.vmap(lambda t: (sol.evaluate(t), sol.derivative(t)))(sol.ts), expected
+
+
+@pytest.mark.parametrize("t0, t1", [(0.0, T1), (T1, 0.0)], ids=["there", "back"])
+@each()
+def test_value_and_slope_at_the_steps_of_every_scheme(scheme: Scheme, t0, t1):
+    dt0 = (t1 - t0) / 8
+    saveat = dfx.SaveAt(t0=True, steps=True, dense=True)
+    kwargs = dict(saveat=saveat, max_steps=8)
+    sol = solve(SYSTEM, scheme.solver, t0, t1, dt0, Y0, **kwargs)
+    assert sol.ts is not None and np.all(np.isfinite(sol.ts))
+    (values, slopes), expected = at_the_steps(sol)
+    assert_close(values, sol.ys, 0)  # bit for bit
+    assert_close(slopes, expected, 1e-12)
+
+
+# A single step, without a solver
+
+CUBIC = np.array([0.3, -1.0, 0.5, 2.0])
+QUINTIC = np.array([0.2, 0.1, -0.7, 0.4, -1.0, 1.5])
+
+
+def value(polynomial, t, m=0):
+    """A derivative of a polynomial, as a pytree."""
+    x = jnp.asarray(np.polyval(np.polyder(polynomial, m), t))
+    return {"a": jnp.array([x, 2 * x]), "b": (x,)}
+
+
+def hermite(polynomial, t0, t1, second):
+    scaled = lambda t, m: jax.tree.map(
+        lambda x: (t1 - t0) ** m * x, value(polynomial, t, m)
+    )
+    ends = dict(y0=scaled(t0, 0), y1=scaled(t1, 0), k0=scaled(t0, 1), k1=scaled(t1, 1))
+    if second:
+        ends |= dict(b0=scaled(t0, 2), b1=scaled(t1, 2))
+    return dps.HermiteInterpolation(t0=jnp.array(t0), t1=jnp.array(t1), **ends)
+
+
+@pytest.mark.parametrize("t0, t1", [(0.5, 2.0), (2.0, 0.5)])
+@pytest.mark.parametrize(
+    "polynomial, second", [(CUBIC, False), (QUINTIC, True)], ids=["cubic", "quintic"]
+)
+def test_polynomials_are_met_exactly(polynomial, second, t0, t1):
+    step = hermite(polynomial, t0, t1, second)
+    for t in (0.5, 0.8, 1.4, 2.0):
+        assert_close(step.evaluate(jnp.array(t)), value(polynomial, t), 1e-14)
+        assert_close(step.derivative(jnp.array(t)), value(polynomial, t, 1), 1e-13)
+
+
+def test_a_quintic_is_no_cubic():
+    y = hermite(QUINTIC, 0.5, 2.0, second=False).evaluate(jnp.array(1.4))
+    assert np.max(np.abs(flat(y) - flat(value(QUINTIC, 1.4)))) > 1e-3
+
+
+@pytest.mark.parametrize("second", [False, True], ids=["cubic", "quintic"])
+def test_a_step_of_no_length_has_a_derivative(second):
+    # Such as `vmap` takes where one solve is over before the others.
+    step = hermite(QUINTIC, 1.0, 1.0, second)
+
+    def first(y0):
+        ends = dict(k0=step.k0, k1=step.k1, b0=step.b0, b1=step.b1)
+        at = dps.HermiteInterpolation(t0=step.t0, t1=step.t1, y0=y0, y1=y0, **ends)
+        return at.evaluate(jnp.array(1.0))["b"][0]
+
+    gradient = jax.grad(first)(step.y0)
+    assert_close(gradient, {"a": jnp.zeros(2), "b": (jnp.array(1.0),)}, 0)
