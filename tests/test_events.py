@@ -271,3 +271,124 @@ def test_events_under_vmap():
     assert np.all(np.diff(together) > 0.1)  # the further up the later
     for t, q in zip(together, q0, strict=True):
         assert abs(t - time(q)) < 1e-13
+
+
+# How to go on, for all that is carried: a force, the force of a scheme inside of
+# another, that of a splitting, a copy.
+
+GOING_ON = {
+    "leapfrog": dps.PresymplecticLeapfrog(),
+    "Yoshida": dps.PresymplecticYoshida4(),
+    "splitting": dps.BlanesMoanRKN4(),
+    "Tao": dps.PresymplecticTao(5.0),
+}
+
+
+@eqx.filter_jit
+def _let_go(solver, t0, t1, y0, solver_state, made_jump, event):
+    return dfx.diffeqsolve(
+        *(dps.HamiltonianTerm(system()), solver, t0, t1, jnp.array(0.125), y0),
+        solver_state=solver_state,
+        made_jump=made_jump,
+        event=event,
+        saveat=dfx.SaveAt(t0=True, steps=True, solver_state=True),
+        max_steps=64,
+    )
+
+
+def let_go(solver, t0, t1, y0, event=None, solver_state=None, made_jump=False):
+    if solver_state is None:
+        term = dps.HamiltonianTerm(system())
+        solver_state = solver.init(term, t0, t1, y0, None)
+    # An array, so that with and without a jump are one compilation.
+    return _let_go(solver, t0, t1, y0, solver_state, jnp.array(made_jump), event)
+
+
+def every(sol):
+    """All that was saved."""
+    saved = np.isfinite(sol.ts)
+    return jax.tree.map(lambda x: x[saved], (sol.ts, *sol.ys))
+
+
+def ending(sol):
+    return jax.tree.map(lambda x: x[-1], every(sol))
+
+
+START = jnp.array(0.0), jnp.array(4.0), (jnp.array(1.5), jnp.array(0.0))
+
+
+@pytest.mark.parametrize("solver", GOING_ON.values(), ids=GOING_ON)
+def test_where_a_solver_state_belongs(solver):
+    whole = let_go(solver, *START)
+    # A boolean event ends with its step, and the solver state with it: going on from
+    # there is one solve, bit for bit.
+    stopped = let_go(solver, *START, event=dfx.Event(past_the_bottom))
+    t, *y = ending(stopped)
+    rest = let_go(solver, t, START[1], tuple(y), solver_state=stopped.solver_state)
+    n = len(every(stopped)[0])
+    assert_close(every(rest), jax.tree.map(lambda x: x[n - 1 :], every(whole)), 0)
+
+    # An event that a root finder looks for ends within that step, and the solver state
+    # is the same as before: of another point.
+    event = dfx.Event(through_the_bottom, FINDER)
+    within = let_go(solver, *START, event=event)
+    assert_close(within.solver_state, stopped.solver_state, 1e-14)
+    assert ending(within)[0] < t
+    t, *y = ending(within)
+    fresh = let_go(solver, t, START[1], tuple(y))
+    carry = within.solver_state
+    stale = let_go(solver, t, START[1], tuple(y), solver_state=carry)
+    assert np.max(np.abs(flat(ending(stale)) - flat(ending(fresh)))) > 1e-4
+    # Saying that a jump was made mends it.
+    mended = let_go(solver, t, START[1], tuple(y), solver_state=carry, made_jump=True)
+    assert_close(ending(mended), ending(fresh), 1e-14)
+
+
+def test_nothing_is_saved_after_the_event():
+    ts = jnp.linspace(0, 4, 41)
+    event, saveat = dfx.Event(through_the_bottom, FINDER), dfx.SaveAt(ts=ts, t1=True)
+    sol = dfx.diffeqsolve(
+        *(dps.HamiltonianTerm(system()), dps.BlanesMoanRKN6(), START[0], START[1]),
+        dt0=0.31,
+        y0=START[2],
+        event=event,
+        saveat=saveat,
+    )
+    t, q, _ = every(sol)
+    assert len(t) == np.sum(ts < t[-1]) + 1
+    assert np.all(q[:-1] > 0) and abs(q[-1]) < 1e-12
+
+
+def test_a_batch_of_which_some_have_an_event():
+    q0 = jnp.array([0.5, 1.5, 3.1])
+    event = dfx.Event(through_the_bottom, FINDER)
+
+    def end(q0):
+        t0, t1, (_, p0) = START
+        sol = let_go(dps.PresymplecticTao(5.0), t0, t1, (q0, p0), event=event)
+        assert sol.ts is not None and sol.ys is not None
+        return (sol.ts, *sol.ys), jnp.asarray(sol.event_mask)
+
+    batch, occurred = jax.vmap(end)(q0)
+    assert occurred.tolist() == [True, True, False]
+    for i, x in enumerate(q0):
+        alone, _ = end(x)
+        saved = np.isfinite(alone[0])
+        both = jax.tree.map(lambda a, b, i=i, s=saved: (a[i][s], b[s]), batch, alone)
+        for together, single in both:
+            # Newton's method stops at its tolerance.
+            assert_close(together, single, 1e-11)
+
+
+@pytest.mark.parametrize("solver", [dps.PresymplecticTao(5.0), dps.BlanesMoanRKN4()])
+def test_event_time_is_differentiable_in_forward_mode(solver):
+    def end(gamma):
+        adjoint = dfx.ForwardMode()
+        sol = swing(solver, 0.1, gamma=gamma, adjoint=adjoint, max_steps=64)
+        return jnp.stack(last(sol))
+
+    e = 1e-5
+    slopes = jax.jit(jax.jacfwd(end))(jnp.array(GAMMA))
+    ends = jax.jit(jax.vmap(end))(jnp.array([GAMMA - e, GAMMA + e]))
+    assert_close(slopes, (ends[1] - ends[0]) / (2 * e), 1e-7)
+    assert abs(slopes[0]) > 0.1
