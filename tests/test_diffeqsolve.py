@@ -565,3 +565,95 @@ def test_a_step_is_the_same_in_a_solve_and_alone(scheme: Scheme):
     y, *_ = step(SYSTEM, scheme.solver, 1.0, t1, Y0, ARGS)
     solved, _ = go(scheme, 1.0, t1, Y0)
     assert_close(solved, y, 1e-15)
+
+
+# Splittings, of which the tests above have none
+
+SPLITTINGS = [
+    Scheme("rkn_4", dps.BlanesMoanRKN4(), 4, 6, kind="quadratic"),  # carries a force
+    Scheme("rkn_6", dps.BlanesMoanRKN6(), 6, 14, kind="quadratic"),  # carries nothing
+]
+
+
+@each(SPLITTINGS)
+def test_splittings_go_on_and_back(scheme: Scheme, exact):
+    y, state = go(scheme, 1.0, 3.0, Y0)
+    halfway, carried = go(scheme, 1.0, 2.0, Y0)
+    assert_close(halfway, exact(2.0), accuracy(scheme))
+    assert_close(go(scheme, 2.0, 3.0, halfway, carried), (y, state), 0)
+    assert_close(go(scheme, 3.0, 1.0, y)[0], Y0, 1e-12)
+
+
+@each(SPLITTINGS)
+def test_substeps_of_splittings_are_steps(scheme: Scheme):
+    times = jnp.array([1.0, 1.125, 1.25, 1.375, 1.5])
+    whole = march(TERM, dps.Substeps(scheme.solver, 2), times[::2], Y0)
+    parts = march(TERM, scheme.solver, times, Y0)
+    assert_close(whole, jtu.tree_map(lambda y: y[::2], parts), 1e-14)
+
+
+# Adjoints
+
+
+@each([*SPLITTINGS[:1], *(s for s in SCHEMES if s.name == "tao_fixed")])
+def test_adjoints_agree(scheme: Scheme):
+    def end(gamma, adjoint):
+        damping = dps.ConstantDamping(gamma)
+        term = dps.HamiltonianTerm(dps.ConformalHamiltonian(KINETIC, swing, damping))
+        sol = dfx.diffeqsolve(
+            *(term, scheme.solver, 0.0, 1.0, 0.125, Y0, ARGS),
+            adjoint=adjoint,
+            max_steps=8,
+        )
+        assert sol.ys is not None
+        return jnp.sum(sol.ys[0] ** 2)
+
+    @jax.jit
+    def slopes(gamma):
+        checkpoints = jax.grad(end)(gamma, dfx.RecursiveCheckpointAdjoint())
+        direct = jax.grad(end)(gamma, dfx.DirectAdjoint())
+        forward = jax.jacfwd(end)(gamma, dfx.ForwardMode())
+        return jnp.stack([checkpoints, direct, forward])
+
+    found = slopes(jnp.array(0.3))
+    assert abs(found[0]) > 1e-2
+    assert_close(found, jnp.full(3, found[0]), 1e-13)
+
+
+# A jump of a force that is not constant
+
+
+def jolt(t, q, args):
+    """A pendulum that is pushed to one side until 1.4, and to the other from then."""
+    return args * jnp.sum(1 - jnp.cos(q)) + jnp.where(t < 1.4, -1.0, 2.0) * jnp.sum(q)
+
+
+# It converges. That the force carried is new at the jump is what constant forces show.
+@of("leapfrog_AB", "tao")
+def test_a_clipped_solve_is_two_solves(scheme: Scheme):
+    system = dps.ConformalHamiltonian(KINETIC, jolt, dps.LogDamping(1.5))
+
+    @eqx.filter_jit
+    def end(solver, t0, t1, y0, jump_ts, rtol):
+        controller = dfx.PIDController(rtol=rtol, atol=rtol)
+        sol = dfx.diffeqsolve(
+            *(dps.HamiltonianTerm(system), solver, t0, t1, 0.05, y0, ARGS),
+            stepsize_controller=dfx.ClipStepSizeController(controller, jump_ts=jump_ts),
+        )
+        return jtu.tree_map(lambda y: y[-1], sol.ys), sol.stats["num_steps"]
+
+    # On either side of the jump the force is smooth, if the jump is left out. The last
+    # step of the first part ends just before it.
+    before = jnp.nextafter(jnp.array(1.4), jnp.array(0.0))
+    jump_ts, none = jnp.array([1.4]), jnp.array([9.0])
+    reference, tight = dfx.Tsit5(), jnp.array(1e-10)
+    y, _ = end(reference, jnp.array(1.0), before, Y0, none, tight)
+    y, _ = end(reference, jnp.array(1.4), jnp.array(2.0), y, none, tight)
+    solver = dfx.HalfSolver(scheme.solver)
+    span = jnp.array(1.0), jnp.array(2.0), Y0
+    errors = []
+    for rtol in (1e-4, 1e-6):
+        found, _ = end(solver, *span, jump_ts, jnp.array(rtol))
+        errors.append(np.max(np.abs(flat(found) - flat(y))))
+        assert errors[-1] < 20 * rtol
+    assert errors[1] < errors[0] / 10
