@@ -226,7 +226,7 @@ def scaling(tuned, methods, sizes, repeats, longest, errors):
 def heyoka_runs(n, errors):
     """heyoka over a batch: one by one, and by the lanes of the processor."""
     try:
-        import heyoka as hy
+        import heyoka as hy  # pyright: ignore[reportMissingImports]
     except ImportError:
         return {}
     equations = symbolic(PENDULUM, hy)
