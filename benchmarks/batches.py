@@ -9,7 +9,8 @@ warmed up, by turns; a number is the median, or one run if that takes seconds. W
 time for a smaller batch says that a solve would take too long, and where it would take
 more than a million steps, it is left out.
 
-The second table is a batch of 1024 with what else matters on a CPU: the sine, which XLA
+The other tables are batches of 1024: damped Henon-Heiles systems, whose force is a
+polynomial, and the pendulums with what else matters on a CPU: the sine, which XLA
 evaluates one by one in double precision, written as a polynomial; and the batch cut
 into blocks, `jax.lax.map(solve, y0, batch_size=512)`, too small for XLA to spread each
 operation over threads, which costs more than it gains at this size. heyoka is
@@ -38,8 +39,6 @@ import diffrax_presym as dps
 
 jax.config.update("jax_enable_x64", True)
 
-PENDULUM = problems.pendulum()
-T1 = PENDULUM.t1
 SIZES = (1, 64, 4096, 262144)
 TARGETS = (1e-6, 1e-9)
 BLOCK = 512
@@ -69,12 +68,25 @@ DIFFRAX = [
 ]
 
 
-def starts(n):
-    """The first `n` of a sequence that fills a square evenly, hardest start first."""
+@dataclasses.dataclass(frozen=True)
+class Batch:
+    problem: problems.Problem
+    # The first `n` starting points, with an array for each coordinate.
+    starts: Callable
+    # Other ways to write the Hamiltonian, by name.
+    variants: dict[str, dps.AbstractHamiltonian]
+
+
+def spread(n, *boxes):
+    """The first `n` of a sequence that fills a box, of `(first, side)` each way."""
+    # The powers of the root of x^(d+1) = x + 1, the golden ratio's kin.
+    ratio = max(np.roots([1] + [0] * (len(boxes) - 1) + [-1, -1]).real)
+    powers = ratio ** -np.arange(1.0, len(boxes) + 1)
     i = np.arange(n)
-    q0 = 2.5 - 5 * (i * 0.7548776662466927 % 1)
-    p0 = (i * 0.5698402909980532 + 0.5) % 1 - 0.5
-    return jnp.asarray(q0), jnp.asarray(p0)
+    return [
+        jnp.asarray(side * (0.5 - (i * power + 0.5 - first / side) % 1))
+        for power, (first, side) in zip(powers, boxes, strict=True)
+    ]
 
 
 def polynomial_sine(x):
@@ -88,16 +100,33 @@ def polynomial_sine(x):
     return jnp.where(turns - 2 * jnp.floor(turns / 2) == 0, x, -x)
 
 
-def with_polynomial():
-    return dps.ConformalHamiltonian(
+def pendulums():
+    problem = problems.pendulum()
+    polynomial = dps.ConformalHamiltonian(
         dps.QuadraticKinetic(),
         lambda t, q, args: -jnp.sum(jnp.cos(q)),
-        dps.ConstantDamping(0.1),
+        problem.hamiltonian.damping,
         force=lambda t, q, args: -polynomial_sine(q),
+    )
+    return Batch(
+        problem,
+        # The hardest first.
+        lambda n: tuple(spread(n, (2.5, 5.0), (0.0, 1.0))),
+        {"XLA's sine": problem.hamiltonian, "polynomial sine": polynomial},
     )
 
 
-def batched(hamiltonian, method, block=None):
+def henon_heiles():
+    problem = problems.henon_heiles()
+
+    def starts(n):
+        x, y, px, py = spread(n, *[(0.25, 0.5)] * 4)
+        return (x, y), (px, py)
+
+    return Batch(problem, starts, {"polynomial force": problem.hamiltonian})
+
+
+def batched(hamiltonian, t1, method, block=None):
     """`solve(y0, x)`, with `x` the number of steps, or the tolerance."""
     term = dps.HamiltonianTerm(hamiltonian)
 
@@ -109,8 +138,8 @@ def batched(hamiltonian, method, block=None):
             term,
             method.solver,
             t0=0.0,
-            t1=T1,
-            dt0=None if method.adaptive else T1 / x,
+            t1=t1,
+            dt0=None if method.adaptive else t1 / x,
             y0=y0,
             max_steps=None,
             throw=False,
@@ -124,26 +153,30 @@ def batched(hamiltonian, method, block=None):
     return jax.jit(blocks)
 
 
+def rows(y):
+    """A row for each coordinate."""
+    leaves = np.array(jax.tree.leaves(y))
+    return leaves.reshape(-1, leaves.shape[-1])
+
+
 class Errors:
     """The largest error over a batch, relative to the largest entry of the solution."""
 
-    def __init__(self, n):
-        fine = batched(PENDULUM.hamiltonian, DIFFRAX[2])
-        self.exact, coarser = (
-            np.array(fine(starts(n), jnp.asarray(steps))) for steps in (4e3, 3e3)
-        )
+    def __init__(self, batch, n):
+        fine = batched(batch.problem.hamiltonian, batch.problem.t1, DIFFRAX[2])
+        y0 = batch.starts(n)
+        self.exact = rows(fine(y0, jnp.asarray(4e3)))
         self.largest = np.max(np.abs(self.exact))
-        assert self.of(coarser) < 1e-12
+        assert self.of(fine(y0, jnp.asarray(3e3))) < 1e-12
 
     def of(self, y):
-        n = min(len(y[0]), self.exact.shape[1])
-        y = np.array([np.asarray(x[:n]) for x in y])
-        return np.max(np.abs(y - self.exact[:, :n])) / self.largest
+        y = rows(y)
+        n = min(y.shape[1], self.exact.shape[1])
+        return np.max(np.abs(y[:, :n] - self.exact[:, :n])) / self.largest
 
 
-def tune(solve, method, target, errors):
+def tune(solve, method, target, errors, y0):
     """The fewest steps, or the largest tolerance, that reach the target, nearly."""
-    y0 = starts(64)
     x, good = (target if method.adaptive else 300.0), None
     for _ in range(8):
         if x > MOST_STEPS:
@@ -190,7 +223,20 @@ def program(solve, y0, x, warm=True):
     return call
 
 
-def scaling(tuned, methods, sizes, repeats, longest, errors):
+def tune_all(batch, methods, errors):
+    """The number of steps, or the tolerance, by method and target."""
+    tuned = {}
+    for method in methods:
+        solve = batched(batch.problem.hamiltonian, batch.problem.t1, method)
+        for target in TARGETS:
+            x = tune(solve, method, target, errors, batch.starts(64))
+            tuned[method.name, target] = solve, x
+    return tuned
+
+
+def scaling(batch, methods, sizes, repeats, longest):
+    errors = Errors(batch, min(max(sizes), CHECKED))
+    tuned = tune_all(batch, methods, errors)
     head = "".join(f"{f'batch of {n}':>18}" for n in sizes)
     print(
         f"\nMicroseconds per trajectory, and error\n{'':24}{head}{'trajectories/s':>16}"
@@ -200,7 +246,7 @@ def scaling(tuned, methods, sizes, repeats, longest, errors):
         rates = dict.fromkeys(cells, 0.0)
         last = dict.fromkeys(cells, 0.0)
         for n in sizes:
-            y0 = starts(n)
+            y0 = batch.starts(n)
             short, long = {}, {}
             for method in methods:
                 solve, x = tuned[method.name, target]
@@ -223,32 +269,33 @@ def scaling(tuned, methods, sizes, repeats, longest, errors):
             print(f"  {name:22}" + "".join(f"{c:>18}" for c in row) + rate, flush=True)
 
 
-def heyoka_runs(n, errors):
+def heyoka_runs(batch, n, errors):
     """heyoka over a batch: one by one, and by the lanes of the processor."""
     try:
         import heyoka as hy  # pyright: ignore[reportMissingImports]
     except ImportError:
         return {}
-    equations = symbolic(PENDULUM, hy)
-    y0 = np.array(starts(n))
+    equations = symbolic(batch.problem, hy)
+    y0 = rows(batch.starts(n))
     lanes = hy.recommended_simd_size()
 
     def serial(tolerance):
-        integrator = hy.taylor_adaptive(equations, np.zeros(2), tol=tolerance)
+        zeros = np.zeros(len(y0))
+        integrator = hy.taylor_adaptive(equations, zeros, tol=tolerance)
 
         def solve():
             out = np.empty_like(y0)
             for i in range(n):
                 integrator.time = 0.0
                 integrator.state[:] = y0[:, i]
-                integrator.propagate_until(T1)
+                integrator.propagate_until(batch.problem.t1)
                 out[:, i] = integrator.state
             return out
 
         return solve
 
     def in_lanes(tolerance):
-        zeros = np.zeros((2, lanes))
+        zeros = np.zeros((len(y0), lanes))
         integrator = hy.taylor_adaptive_batch(equations, zeros, tol=tolerance)
 
         def solve():
@@ -256,7 +303,7 @@ def heyoka_runs(n, errors):
             for i in range(0, n, lanes):
                 integrator.set_time(0.0)
                 integrator.state[:] = y0[:, i : i + lanes]
-                integrator.propagate_until(T1)
+                integrator.propagate_until(batch.problem.t1)
                 out[:, i : i + lanes] = integrator.state
             return out
 
@@ -277,24 +324,28 @@ def heyoka_runs(n, errors):
     return runs
 
 
-def beside_heyoka(tuned, methods, n, repeats, errors):
-    y0 = starts(n)
+def beside_heyoka(batch, methods, n, repeats):
+    errors = Errors(batch, n)
+    tuned = tune_all(batch, methods, errors)
+    y0 = batch.starts(n)
     calls: dict[tuple[str, float], Callable] = {}
-    sines = {"XLA's sine": PENDULUM.hamiltonian, "polynomial": with_polynomial()}
-    for sine, hamiltonian in sines.items():
+    for variant, hamiltonian in batch.variants.items():
         for block in (None, BLOCK) if n > BLOCK else (None,):
-            how = f"{sine}, {'vmap' if block is None else f'blocks of {block}'}"
+            how = f"{variant}, {'vmap' if block is None else f'blocks of {block}'}"
             for method in methods:
-                solve = batched(hamiltonian, method, block)
+                solve = batched(hamiltonian, batch.problem.t1, method, block)
                 for target in TARGETS:
                     _, x = tuned[method.name, target]
                     if x is not None:
                         key = f"{method.name:20} {how}", target
                         calls[key] = program(solve, y0, x)
-    calls |= heyoka_runs(n, errors)
+    calls |= heyoka_runs(batch, n, errors)
     found = by_turns(calls, repeats)
-    print(f"\nA batch of {n}: microseconds per trajectory, of all cores, and error")
-    print(f"{'':46}" + "".join(f"{f'error {t:.0e}':>24}" for t in TARGETS))
+    print(
+        f"\n{batch.problem.name}, a batch of {n}: microseconds per trajectory, "
+        f"of all cores, and error\n{'':46}"
+        + "".join(f"{f'error {t:.0e}':>24}" for t in TARGETS)
+    )
     for name in dict.fromkeys(name for name, _ in calls):
         row = ""
         for target in TARGETS:
@@ -309,17 +360,17 @@ def beside_heyoka(tuned, methods, n, repeats, errors):
     rivals = {"Diffrax": names(DIFFRAX)}
     rivals |= {name: name for name, _ in calls if name.startswith("heyoka")}
     for target in TARGETS:
-        for sine in sines:
+        for variant in batch.variants:
             row = []
             for rival, start in rivals.items():
-                share = sine if rival == "Diffrax" else ""
+                share = variant if rival == "Diffrax" else ""
                 time, cores = (
                     best(found, target, start, share, clock)
-                    / best(found, target, names(OURS), sine, clock)
+                    / best(found, target, names(OURS), variant, clock)
                     for clock in (1, 2)
                 )
                 row.append(f"{rival} {time:.1f} ({cores:.1f})")
-            print(f"  at {target:.0e}, {sine}: " + ", ".join(row))
+            print(f"  at {target:.0e}, {variant}: " + ", ".join(row))
 
 
 def names(methods):
@@ -346,16 +397,11 @@ def main():
     longest = options.longest or (0.3 if quick else 12.0)
     sizes = (1, 64, 256) if quick else SIZES
     print(f"{jax.devices()[0].device_kind}, median of {repeats} runs")
-    errors = Errors(min(max(sizes), CHECKED))
-    tuned = {}
     methods = [OURS[2], DIFFRAX[3]] if quick else OURS + DIFFRAX
-    for method in methods:
-        solve = batched(PENDULUM.hamiltonian, method)
-        for target in TARGETS:
-            tuned[method.name, target] = solve, tune(solve, method, target, errors)
-    scaling(tuned, methods, sizes, repeats, longest, errors)
+    scaling(pendulums(), methods, sizes, repeats, longest)
     few = [m for m in methods if m in OURS[2:] + DIFFRAX[3:]]
-    beside_heyoka(tuned, few, sizes[-1] if quick else 1024, repeats, errors)
+    for batch in pendulums(), henon_heiles():
+        beside_heyoka(batch, few, sizes[-1] if quick else 1024, repeats)
 
 
 if __name__ == "__main__":
