@@ -2,8 +2,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import optimistix as optx
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Inexact, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Inexact, PyTree
 
 
 def as_parameter(x, name: str) -> Inexact[Array, "..."]:
@@ -35,6 +36,11 @@ def tree_add(y: PyTree, h: ArrayLike, dy: PyTree) -> PyTree:
     return jtu.tree_map(lambda yi, di: yi + cast_to(h, yi) * di, y, dy)
 
 
+def tree_sub(x: PyTree, y: PyTree) -> PyTree:
+    """`x - y`."""
+    return jtu.tree_map(jnp.subtract, x, y)
+
+
 def tree_scale(c: ArrayLike | None, y: PyTree) -> PyTree:
     """`c * y`, each leaf in its own precision; no operation at all for `None`."""
     if c is None:
@@ -49,10 +55,31 @@ def tree_dot(x: PyTree, y: PyTree) -> Array:
         return jtu.tree_reduce(jnp.add, dots)
 
 
+def all_finite(x: PyTree) -> Bool[Array, ""]:
+    """Whether all entries of a pytree are finite."""
+    finite = jtu.tree_map(lambda xi: jnp.all(jnp.isfinite(xi)), x)
+    return jtu.tree_reduce(jnp.logical_and, finite, jnp.array(True))
+
+
 def describe(tree: PyTree) -> str:
     """A pytree by the precisions and shapes of its leaves, for errors."""
     leaf = lambda x: f"{jnp.result_type(x)}{list(jnp.shape(x))}"
     return str(jtu.tree_map(leaf, tree)).replace("'", "")
+
+
+def check_root_finder(root_finder) -> None:
+    if not isinstance(root_finder, optx.AbstractRootFinder):
+        raise ValueError(
+            "`root_finder` must be an Optimistix root finder, for example "
+            f"`optimistix.Newton(rtol=1e-10, atol=1e-10)`, but got {root_finder!r}."
+        )
+    # Diffrax's own root finders leave their tolerances to an adaptive controller.
+    for name in ("rtol", "atol"):
+        if not eqx.is_array_like(getattr(root_finder, name, 0.0)):
+            raise ValueError(
+                f"`root_finder` needs a tolerance `{name}` of its own. Write for "
+                "example `optimistix.Newton(rtol=1e-10, atol=1e-10)`."
+            )
 
 
 def scalar_fn(fn, name: str):

@@ -1,3 +1,5 @@
+from typing import Any
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -11,6 +13,11 @@ from ._misc import cast_to, describe, tree_scale
 
 
 State = tuple[PyTree[Inexact[Array, "..."]], PyTree[Inexact[Array, "..."]]]
+
+
+# The closest there is to say of a state at which the energy is not defined. Older
+# versions of Optimistix have no word for it.
+_INVALID: Any = getattr(dfx.RESULTS, "nonfinite", dfx.RESULTS.nonlinear_divergence)
 
 
 class HamiltonianTerm(dfx.AbstractTerm):
@@ -89,8 +96,21 @@ class View(eqx.Module):
     def velocity(self, t, y: State):
         return self.hamiltonian.velocity(t, *y, self.args)
 
+    def check(self, t, y: State) -> dfx.RESULTS | None:
+        """A failure where the energy is not defined."""
+        valid = self.hamiltonian.is_valid(t, *y, self.args)
+        if valid is None:
+            return None
+        return dfx.RESULTS.where(valid, dfx.RESULTS.successful, _INVALID)
+
     def force(self, t, y: State):
-        force = self.hamiltonian.force(t, *y, self.args)
+        return self._stored(self.hamiltonian.force(t, *y, self.args), t, y)
+
+    def potential_force(self, t, y: State):
+        """The force that a splitting kicks with."""
+        return self._stored(self.hamiltonian.potential_force(t, *y, self.args), t, y)
+
+    def _stored(self, force, t, y: State):
         # Selecting between two arrays, although always the first, makes XLA store the
         # force. It would rather recompute an elementwise force wherever it is used.
         return jtu.tree_map(lambda f, q: jnp.where(t == t, f, q), force, y[0])

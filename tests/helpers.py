@@ -52,6 +52,7 @@ SCHEMES = [
     Scheme("suzuki_yoshida_6", dps.SuzukiYoshida(6), 6, 9),
     Scheme("suzuki_yoshida_8", dps.SuzukiYoshida(8), 8, 27),
     Scheme("substeps", dps.Substeps(dps.PresymplecticLeapfrog(), 3), 2, 3),
+    Scheme("strang", dps.Strang(), 2, 1, kind="split"),
     Scheme("tao", dps.PresymplecticTao(), 2, 3, kind="augmented"),
     Scheme("tao_fixed", dps.PresymplecticTao(5.0), 2, 3, kind="augmented"),
     Scheme(

@@ -1,4 +1,5 @@
 from ._base import AbstractHamiltonian as AbstractHamiltonian
+from ._bregman import BregmanHamiltonian as BregmanHamiltonian
 from ._damping import (
     AbstractDamping as AbstractDamping,
     ConstantDamping as ConstantDamping,
@@ -17,5 +18,20 @@ from ._kinetic import (
     AbstractKinetic as AbstractKinetic,
     QuadraticKinetic as QuadraticKinetic,
     RelativisticKinetic as RelativisticKinetic,
+)
+from ._mirror import (
+    AbstractMirrorMap as AbstractMirrorMap,
+    EntropyMirror as EntropyMirror,
+    EuclideanMirror as EuclideanMirror,
+    HyperbolicMirror as HyperbolicMirror,
+    LogBarrierMirror as LogBarrierMirror,
+    MirrorMap as MirrorMap,
+    PNormMirror as PNormMirror,
+)
+from ._scaling import (
+    AbstractScaling as AbstractScaling,
+    ExponentialScaling as ExponentialScaling,
+    PolynomialScaling as PolynomialScaling,
+    Scaling as Scaling,
 )
 from ._vector_field import VectorField as VectorField

@@ -3,7 +3,7 @@ from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Inexact, PyTree
+from jaxtyping import Array, Bool, Inexact, PyTree
 
 from .._misc import tree_scale
 from ._damping import AbstractDamping, Scalar, Time
@@ -69,6 +69,22 @@ class AbstractHamiltonian(eqx.Module):
 
         Exact where it is known in closed form, and else to the given order in `h`.
         """
+
+    def potential_force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
+        r"""The force $-\partial V / \partial q$ of the potential part, if split.
+
+        All of `force`, unless the kinetic part depends on `q` too.
+        """
+        return self.force(t, q, p, args)
+
+    def is_valid(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> Bool[Array, ""] | None:
+        """Whether the energy is defined at this state. Where it is not, a solve fails.
+
+        `None`, the default, where it is not worth checking.
+        """
+        return None
 
     def log_scale(self, t: Time) -> Scalar:
         r"""The log scale $\eta(t)$; 0 for a system without damping."""

@@ -50,6 +50,9 @@ class _AbstractDamped(AbstractHamiltonian):
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         return self.undamped.force(t, q, p, args)
 
+    def is_valid(self, t, q, p, args=None):
+        return self.undamped.is_valid(t, q, p, args)
+
     def drift(
         self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8
     ) -> tuple[Q, P]:

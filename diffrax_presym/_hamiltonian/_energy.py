@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import PyTree
 
-from .._misc import match, scalar_fn, tree_add
+from .._misc import all_finite, match, scalar_fn, tree_add
 from ._base import AbstractHamiltonian, P, Q
 from ._damping import AbstractDamping, move_frame, Scalar, Time
 from ._kinetic import AbstractKinetic, as_kinetic, integrate_velocity
@@ -172,6 +172,9 @@ class Hamiltonian(AbstractHamiltonian):
             slope = jax.grad(self.energy, argnums=1)(t, q, p, args)
             return jtu.tree_map(jnp.negative, slope)
         return match(self.force_fn(t, q, p, args), q, "`force`", "`q`")
+
+    def is_valid(self, t, q, p, args=None):
+        return all_finite((q, p))
 
     def drift(
         self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8

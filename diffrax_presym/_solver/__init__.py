@@ -18,6 +18,7 @@ from ._splitting import (
     BlanesMoanRKN4 as BlanesMoanRKN4,
     BlanesMoanRKN6 as BlanesMoanRKN6,
     Splitting as Splitting,
+    Strang as Strang,
 )
 from ._tableaus import SplittingTableau as SplittingTableau
 from ._tao import PresymplecticTao as PresymplecticTao

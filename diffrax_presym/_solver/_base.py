@@ -17,7 +17,7 @@ import optimistix as optx
 from jaxtyping import Array, PyTree
 
 from .._interpolation import HermiteInterpolation
-from .._misc import cast_to, tree_add, tree_scale
+from .._misc import cast_to, check_root_finder, tree_add, tree_scale, tree_sub
 from .._term import check_state, State, View, view
 
 
@@ -87,6 +87,7 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
             carry = lax.cond(made_jump, restart, lambda: solver_state)
         h = t1 - t0
         y1, new_carry, result = self.advance(system, t0, t1, h, y0, carry)
+        result = first_failure(result, system.check(t1, y1))
         slope0 = self.slope(system, t0, y0, carry)
         slope1 = self.slope(system, t1, y1, new_carry)
         dense_info = dict(
@@ -144,7 +145,7 @@ class AbstractKickDriftSolver(AbstractPresymplecticSolver[_Carry]):
                 f'`first` must be "momentum" or "position", but got {self.first!r}.'
             )
         if self.root_finder is not None:
-            _check_root_finder(self.root_finder)
+            check_root_finder(self.root_finder)
 
     def momentum_first(self, view: View, t, h, y: State, force=None):
         """Kick at `t`, then drift to `t + h` with the velocity frozen at `t`.
@@ -180,15 +181,22 @@ class AbstractKickDriftSolver(AbstractPresymplecticSolver[_Carry]):
         if view.is_separable:
             return fn(guess), None
         if self.root_finder is None:
+            if view.hamiltonian.is_split:
+                instead = "use `Strang()` or `BlanesMoan4()`, which are explicit."
+            else:
+                instead = (
+                    "use `PresymplecticTao()`, which is explicit; or, if the energy is "
+                    "a sum T(t, p) + V(t, q), give its parts: `SeparableHamiltonian("
+                    "kinetic, potential)` or `ConformalHamiltonian(kinetic, potential, "
+                    "damping)`."
+                )
             raise ValueError(
                 f"This `{type(view.hamiltonian).__name__}` is not separable, so "
                 f"`{type(self).__name__}` is implicit. Pass it a root finder, for "
                 "example `root_finder=optimistix.Newton(rtol=1e-10, atol=1e-10)`; or "
-                "use `PresymplecticTao()`, which is explicit; or, if the energy is a "
-                "sum T(t, p) + V(t, q), give its parts: `SeparableHamiltonian(kinetic, "
-                "potential)` or `ConformalHamiltonian(kinetic, potential, damping)`."
+                + instead
             )
-        residual = lambda x, _: jtu.tree_map(jnp.subtract, fn(x), x)
+        residual = lambda x, _: tree_sub(fn(x), x)
         solution = optx.root_find(
             residual,
             self.root_finder,
@@ -197,21 +205,6 @@ class AbstractKickDriftSolver(AbstractPresymplecticSolver[_Carry]):
             throw=False,
         )
         return solution.value, dfx.RESULTS.promote(solution.result)
-
-
-def _check_root_finder(root_finder) -> None:
-    if not isinstance(root_finder, optx.AbstractRootFinder):
-        raise ValueError(
-            "`root_finder` must be an Optimistix root finder, for example "
-            f"`optimistix.Newton(rtol=1e-10, atol=1e-10)`, but got {root_finder!r}."
-        )
-    # Diffrax's own root finders leave their tolerances to an adaptive controller.
-    for name in ("rtol", "atol"):
-        if not eqx.is_array_like(getattr(root_finder, name, 0.0)):
-            raise ValueError(
-                f"`root_finder` needs a tolerance `{name}` of its own. Write for "
-                "example `optimistix.Newton(rtol=1e-10, atol=1e-10)`."
-            )
 
 
 def first_failure(result: Result, other: Result) -> Result:

@@ -96,6 +96,11 @@ SOFRONIOU_SPALETTA_10 = CompositionTableau(
     ),
 )
 
+# G. Strang (1968), SIAM J. Numer. Anal. 5, 506.
+STRANG = SplittingTableau(
+    order=2, kick_first=True, quadratic=False, fractions=(0.5, 1.0, 0.5)
+)
+
 # S. Blanes and P. C. Moan (2002), J. Comput. Appl. Math. 142, 313, S6.
 BLANES_MOAN_4 = SplittingTableau(
     order=4,

@@ -1,0 +1,152 @@
+from collections.abc import Callable
+
+import jax
+from jaxtyping import Array, Bool, PyTree
+
+from .._misc import (
+    all_finite,
+    match,
+    scalar_fn,
+    tree_add,
+    tree_dot,
+    tree_scale,
+    tree_sub,
+)
+from ._base import AbstractHamiltonian, P, Q
+from ._damping import _expm1, AbstractDamping, move_frame, Scalar, Time
+from ._energy import _check_callable
+from ._mirror import AbstractMirrorMap
+from ._scaling import AbstractScaling
+
+
+class BregmanHamiltonian(AbstractHamiltonian):
+    r"""The Bregman Hamiltonian, whose motion minimises a function $f$,
+    $H = e^{\alpha + \gamma} [ D_{h^*}(\nabla h(q) + e^{-\gamma} P, \nabla h(q))
+    + e^\beta f(q) ]$.
+
+    Equation (bregman_ham) of França, Jordan and Vidal (2021), after Wibisono, Wilson
+    and Jordan (2016), where $D_{h^*}$ is the Bregman divergence of the convex dual of
+    the mirror map $h$. The log scale is $\gamma$, so the state holds
+    $p = e^{-\gamma} P$, and with $m = \nabla h^*(\nabla h(q) + p)$ the motion is
+
+    $$\dot q = e^\alpha (m - q), \qquad
+    \frac{\mathrm d}{\mathrm dt} \big( \nabla h(q) + p \big)
+    = -e^{\alpha + \beta} \nabla f(q).$$
+
+    While nothing kicks, $m$ stays where it is and $q$ decays towards it like
+    $e^{-\gamma}$: the drift is known in closed form for every mirror map, and every
+    splitting for any kinetic energy is explicit, such as [`diffrax_presym.Strang`][]
+    and [`diffrax_presym.BlanesMoan4`][]. It needs $\nabla h$ and $\nabla h^*$ and no
+    second derivatives. With [`diffrax_presym.EuclideanMirror`][] the Hamiltonian is
+    separable.
+
+    A solve fails where positions leave the domain of the mirror map, where a root find
+    of it fails, or where anything is not finite.
+    """
+
+    mirror_map: AbstractMirrorMap
+    objective: Callable
+    scaling: AbstractScaling
+    gradient_fn: Callable | None
+
+    def __init__(self, mirror_map, objective, scaling, *, gradient=None):
+        r"""**Arguments:**
+
+        - `mirror_map`: the mirror map $h$, for example
+            [`diffrax_presym.EntropyMirror`][].
+        - `objective`: the function to minimise, a function `f(t, q, args)` that returns
+            one number.
+        - `scaling`: the functions $\alpha$, $\beta$ and $\gamma$ of time, for example
+            [`diffrax_presym.PolynomialScaling`][].
+        - `gradient`: the gradient $\nabla f$ by hand, a function
+            `gradient(t, q, args)`. Defaults to automatic differentiation.
+
+        **Raises:**
+
+        `ValueError` if any of these is of the wrong kind, and when the solve is traced
+        if a function returns values of the wrong shape.
+        """
+        if not isinstance(mirror_map, AbstractMirrorMap):
+            raise ValueError(
+                "`mirror_map` must be a mirror map such as `EntropyMirror()`, but got "
+                f"{mirror_map!r}. For a function `h(q)` of your own write "
+                "`MirrorMap(h, root_finder=...)`."
+            )
+        if not isinstance(scaling, AbstractScaling):
+            raise ValueError(
+                "`scaling` must be a scaling such as `PolynomialScaling(2.0)`, but got "
+                f"{scaling!r}. For functions of your own write "
+                "`Scaling(alpha, beta, gamma, t0=t0, t1=t1)`."
+            )
+        _check_callable(objective, "objective", "f(t, q, args)")
+        _check_callable(gradient, "gradient", "gradient(t, q, args)", optional=True)
+        self.mirror_map = mirror_map
+        self.objective = objective
+        self.scaling = scaling
+        self.gradient_fn = gradient
+
+    @property
+    def damping(self) -> AbstractDamping:
+        return self.scaling.gamma
+
+    @property
+    def is_separable(self) -> bool:
+        return self.mirror_map.is_quadratic
+
+    @property
+    def is_split(self) -> bool:
+        return True
+
+    @property
+    def is_quadratic(self) -> bool:
+        return self.mirror_map.is_quadratic
+
+    def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
+        h, step = self.mirror_map, self.mirror_map.step(q, p)
+        there = tree_add(q, 1, step)
+        # D_h*(grad h(q) + p, grad h(q)) is D_h(q, m).
+        divergence = h(q) - h(there) + tree_dot(tree_add(h.gradient(q), 1, p), step)
+        objective = scalar_fn(self.objective, "The objective")(t, q, args)
+        kinetic = tree_scale(self.scaling.rate(t), divergence)
+        potential = tree_scale(self.scaling.strength(t), objective)
+        with jax.numpy_dtype_promotion("standard"):
+            return kinetic + potential
+
+    def velocity(self, t: Time, q: Q, p: P, args: PyTree = None) -> Q:
+        return tree_scale(self.scaling.rate(t), self.mirror_map.step(q, p))
+
+    def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
+        force = self.potential_force(t, q, p, args)
+        if self.is_separable:
+            return force
+        step = self.mirror_map.step(q, p)
+        _, bent = jax.jvp(self.mirror_map.gradient, (q,), (step,))
+        bend = self.mirror_map.project(tree_sub(p, bent))
+        return tree_add(force, self.scaling.rate(t), bend)
+
+    def potential_force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
+        if self.gradient_fn is None:
+            objective = scalar_fn(self.objective, "The objective")
+            slope = jax.grad(objective, argnums=1)(t, q, args)
+        else:
+            slope = match(self.gradient_fn(t, q, args), q, "`gradient`", "`q`")
+        return tree_scale(-self.scaling.strength(t), self.mirror_map.project(slope))
+
+    def drift(
+        self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8
+    ) -> tuple[Q, P]:
+        progress = -_expm1(-self.damping.increment(t, h))
+        dq = tree_scale(progress, self.mirror_map.step(q, p))
+        p1 = move_frame(self.damping, t, h, p)
+        if not self.is_separable:
+            # The image of q moves by more than the frame makes up for.
+            bent = tree_sub(tree_scale(progress, p), self.mirror_map.change(q, dq))
+            p1 = tree_add(p1, 1, self.mirror_map.project(bent))
+        return tree_add(q, 1, dq), p1
+
+    def is_valid(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> Bool[Array, ""] | None:
+        valid = self.mirror_map.contains(q) & all_finite(p)
+        conditions = self.scaling.is_valid(t)
+        return valid if conditions is None else valid & conditions

@@ -1,0 +1,474 @@
+import abc
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import lineax as lx
+import optimistix as optx
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Bool, PyTree
+
+from .._misc import (
+    all_finite,
+    as_parameter,
+    as_positive,
+    cast_to,
+    check_root_finder,
+    match,
+    scalar_fn,
+    tree_dot,
+    tree_sub,
+)
+from ._damping import Scalar
+from ._kinetic import QuadraticKinetic
+
+
+class AbstractMirrorMap(eqx.Module):
+    r"""A convex function $h$, with $\nabla h$, its inverse $\nabla h^*$ and its domain.
+
+    A point $q$ has the mirror image $\nabla h(q)$, which momenta add to. Everything is
+    asked for relative to a point, because differences of mirror images lose most of
+    their digits in `float32`.
+    """
+
+    @property
+    @abc.abstractmethod
+    def is_quadratic(self) -> bool:
+        r"""Whether $\nabla h$ is linear."""
+
+    @abc.abstractmethod
+    def __call__(self, q: PyTree) -> Scalar:
+        """The value $h(q)$, one number."""
+
+    @abc.abstractmethod
+    def gradient(self, q: PyTree) -> PyTree:
+        r"""The mirror image $\nabla h(q)$."""
+
+    @abc.abstractmethod
+    def inverse(self, w: PyTree) -> PyTree:
+        r"""The point $\nabla h^*(w)$ with mirror image $w$."""
+
+    @abc.abstractmethod
+    def contains(self, q: PyTree) -> Bool[Array, ""]:
+        """Whether `q` is inside of the domain. False for anything not finite."""
+
+    @abc.abstractmethod
+    def step(self, q: PyTree, p: PyTree) -> PyTree:
+        r"""The mirror step $\nabla h^*(\nabla h(q) + p) - q$; not finite where there is
+        none."""
+
+    @abc.abstractmethod
+    def change(self, q: PyTree, dq: PyTree) -> PyTree:
+        r"""The difference $\nabla h(q + dq) - \nabla h(q)$."""
+
+    @abc.abstractmethod
+    def project(self, p: PyTree) -> PyTree:
+        """`p` without the part that changes nothing, if there is any."""
+
+
+class EuclideanMirror(AbstractMirrorMap):
+    r"""The mirror map $h(q) = \tfrac12 \, q \cdot M q$: no mirror at all.
+
+    Bregman dynamics is then separable, the quadratic case of the paper, and every
+    scheme applies.
+    """
+
+    kinetic: QuadraticKinetic
+
+    def __init__(self, mass=None):
+        """**Arguments:**
+
+        - `mass`: the mass matrix, in any form of [`diffrax_presym.QuadraticKinetic`][].
+            Defaults to `None`, mass one.
+
+        **Raises:**
+
+        `ValueError` if a mass is known not to be positive, or if its shape does not fit
+        the state (when the solve is traced).
+        """
+        self.kinetic = QuadraticKinetic(mass)
+
+    @property
+    def is_quadratic(self) -> bool:
+        return True
+
+    def __call__(self, q: PyTree) -> Scalar:
+        return tree_dot(q, self.gradient(q)) / 2
+
+    def gradient(self, q: PyTree) -> PyTree:
+        mass = self.kinetic.mass
+        if mass is None:
+            return q
+        if isinstance(mass, lx.AbstractLinearOperator):
+            return mass.mv(q)
+        if eqx.is_array(mass):
+            return jtu.tree_map(lambda qi: _multiply(qi, mass), q)
+        return jtu.tree_map(_multiply, q, mass)
+
+    def inverse(self, w: PyTree) -> PyTree:
+        return self.kinetic.velocity(jnp.zeros(()), w)
+
+    def contains(self, q: PyTree) -> Bool[Array, ""]:
+        return all_finite(q)
+
+    def step(self, q: PyTree, p: PyTree) -> PyTree:
+        return self.inverse(p)
+
+    def change(self, q: PyTree, dq: PyTree) -> PyTree:
+        return self.gradient(dq)
+
+    def project(self, p: PyTree) -> PyTree:
+        return p
+
+
+def _multiply(q, mass):
+    mass = cast_to(mass, q)
+    return mass @ q if mass.ndim == 2 and q.ndim == 1 else mass * q
+
+
+class EntropyMirror(AbstractMirrorMap):
+    r"""The negative entropy $h(q) = \sum_i q_i \log q_i$, for positive numbers.
+
+    Mirror descent with it is multiplicative. With `simplex=True` it lives on the
+    probability simplex, where $\nabla h^*$ is the softmax: positions stay positive and
+    sum to one, to rounding, without projection. A constant added to all momenta of one
+    simplex changes nothing there. It is left out of every force, so that momenta which
+    sum to zero, as those at rest do, keep doing so.
+    """
+
+    simplex: bool = eqx.field(static=True)
+
+    def __init__(self, simplex: bool = False):
+        """**Arguments:**
+
+        - `simplex`: whether the last axis of every array in the state is a point of the
+            probability simplex. Defaults to `False`, any positive numbers.
+        """
+        self.simplex = simplex
+
+    @property
+    def is_quadratic(self) -> bool:
+        return False
+
+    def __call__(self, q: PyTree) -> Scalar:
+        # On the simplex the linear part is a constant, and left away.
+        linear = 0 if self.simplex else 1
+        image = jtu.tree_map(lambda qi: jnp.log(qi) - linear, q)
+        return tree_dot(q, image)
+
+    def gradient(self, q: PyTree) -> PyTree:
+        return jtu.tree_map(jnp.log, q)
+
+    def inverse(self, w: PyTree) -> PyTree:
+        return jtu.tree_map(jax.nn.softmax if self.simplex else jnp.exp, w)
+
+    def contains(self, q: PyTree) -> Bool[Array, ""]:
+        return _everywhere(lambda qi: (qi > 0) & jnp.isfinite(qi), q)
+
+    def step(self, q: PyTree, p: PyTree) -> PyTree:
+        def leaf(q, p):
+            if self.simplex:
+                p = p - jax.nn.logsumexp(p, axis=-1, b=q, keepdims=True)
+            return q * jnp.expm1(p)
+
+        return jtu.tree_map(leaf, q, p)
+
+    def change(self, q: PyTree, dq: PyTree) -> PyTree:
+        return jtu.tree_map(lambda q, dq: jnp.log1p(dq / q), q, dq)
+
+    def project(self, p: PyTree) -> PyTree:
+        if not self.simplex:
+            return p
+        return jtu.tree_map(lambda p: p - jnp.mean(p, axis=-1, keepdims=True), p)
+
+
+class PNormMirror(AbstractMirrorMap):
+    r"""The squared norm $h(q) = \tfrac12 \|q\|_s^2$ of the whole state, $1 < s \le 2$.
+
+    Between the geometry of [`diffrax_presym.EuclideanMirror`][], $s = 2$, and one that
+    favours sparse solutions, $s \to 1$. The Hessian is infinite where an entry is zero,
+    unless $s = 2$: splittings do without it, all other schemes do not.
+    """
+
+    exponent: Scalar
+
+    def __init__(self, exponent):
+        """**Arguments:**
+
+        - `exponent`: the exponent $s$, more than 1 and at most 2.
+
+        **Raises:**
+
+        `ValueError` if the exponent is known to be outside of that range.
+        """
+        name = "`PNormMirror(exponent)`"
+        self.exponent = as_parameter(exponent, name)
+        known = not isinstance(self.exponent, Tracer)
+        if known and not bool(jnp.all((self.exponent > 1) & (self.exponent <= 2))):
+            raise ValueError(
+                f"{name} must be more than 1 and at most 2, but got {exponent}. For a "
+                "square that is not a norm, write `EuclideanMirror(mass)`."
+            )
+
+    @property
+    def is_quadratic(self) -> bool:
+        return False
+
+    def __call__(self, q: PyTree) -> Scalar:
+        return tree_dot(q, self.gradient(q)) / 2
+
+    def gradient(self, q: PyTree) -> PyTree:
+        return _norm_gradient(q, self.exponent)
+
+    def inverse(self, w: PyTree) -> PyTree:
+        return _norm_gradient(w, self.exponent / (self.exponent - 1))
+
+    def contains(self, q: PyTree) -> Bool[Array, ""]:
+        return all_finite(q)
+
+    def step(self, q: PyTree, p: PyTree) -> PyTree:
+        return _difference_step(self, q, p)
+
+    def change(self, q: PyTree, dq: PyTree) -> PyTree:
+        return _difference_change(self, q, dq)
+
+    def project(self, p: PyTree) -> PyTree:
+        return p
+
+
+def _norm_gradient(x: PyTree, s: Scalar) -> PyTree:
+    """The gradient of half the squared `s`-norm; zero, with its slopes, at zero."""
+    power = lambda a, s: jnp.where(a > 0, jnp.where(a > 0, a, 1) ** cast_to(s, a), 0)
+    largest = jtu.tree_reduce(
+        jnp.maximum, jtu.tree_map(lambda x: jnp.max(jnp.abs(x), initial=0), x)
+    )
+    # In units of the largest entry, whose powers neither overflow nor vanish. It does
+    # not change the result, so it need not be differentiated.
+    unit = jax.lax.stop_gradient(jnp.where(largest > 0, largest, 1))
+    scaled = jtu.tree_map(lambda x: x / cast_to(unit, x), x)
+    powers = jtu.tree_map(lambda x: jnp.sum(power(jnp.abs(x), s)), scaled)
+    norm = power(jtu.tree_reduce(jnp.add, powers), 1 / s)
+    factor = unit * power(norm, 2 - s)
+
+    def leaf(x):
+        return cast_to(factor, x) * jnp.sign(x) * power(jnp.abs(x), s - 1)
+
+    return jtu.tree_map(leaf, scaled)
+
+
+class LogBarrierMirror(AbstractMirrorMap):
+    r"""The logarithmic barrier $h(q) = -\sum_i \log q_i$, for positive numbers.
+
+    The geometry of Burg's entropy. Mirror images are negative; a momentum that leaves
+    them so is part of the domain, and a solve that violates it fails.
+    """
+
+    @property
+    def is_quadratic(self) -> bool:
+        return False
+
+    def __call__(self, q: PyTree) -> Scalar:
+        return -tree_dot(*_ones_and(jtu.tree_map(jnp.log, q)))
+
+    def gradient(self, q: PyTree) -> PyTree:
+        return jtu.tree_map(lambda q: -1 / q, q)
+
+    def inverse(self, w: PyTree) -> PyTree:
+        return jtu.tree_map(lambda w: jnp.where(w < 0, -1 / w, jnp.nan), w)
+
+    def contains(self, q: PyTree) -> Bool[Array, ""]:
+        return _everywhere(lambda qi: (qi > 0) & jnp.isfinite(qi), q)
+
+    def step(self, q: PyTree, p: PyTree) -> PyTree:
+        leaf = lambda q, p: jnp.where(q * p < 1, q * q * p / (1 - q * p), jnp.nan)
+        return jtu.tree_map(leaf, q, p)
+
+    def change(self, q: PyTree, dq: PyTree) -> PyTree:
+        return jtu.tree_map(lambda q, dq: dq / q / (q + dq), q, dq)
+
+    def project(self, p: PyTree) -> PyTree:
+        return p
+
+
+class HyperbolicMirror(AbstractMirrorMap):
+    r"""The hyperbolic entropy
+    $h(q) = \sum_i q_i \sinh^{-1}(q_i / s) - \sqrt{q_i^2 + s^2}$.
+
+    Entropic where numbers are large against the scale $s$, and Euclidean where they are
+    small; defined for both signs. A smooth relative of
+    [`diffrax_presym.PNormMirror`][].
+    """
+
+    scale: Scalar
+
+    def __init__(self, scale: ArrayLike = 1.0):
+        """**Arguments:**
+
+        - `scale`: the scale $s$, a positive number in units of `q`. Defaults to 1.
+
+        **Raises:**
+
+        `ValueError` if the scale is known not to be positive.
+        """
+        self.scale = as_positive(scale, "`HyperbolicMirror(scale)`")
+
+    @property
+    def is_quadratic(self) -> bool:
+        return False
+
+    def _root(self, q):
+        return jnp.hypot(q, cast_to(self.scale, q))
+
+    def __call__(self, q: PyTree) -> Scalar:
+        inner = tree_dot(q, self.gradient(q))
+        return inner - tree_dot(*_ones_and(jtu.tree_map(self._root, q)))
+
+    def gradient(self, q: PyTree) -> PyTree:
+        return jtu.tree_map(lambda q: jnp.arcsinh(q / cast_to(self.scale, q)), q)
+
+    def inverse(self, w: PyTree) -> PyTree:
+        return jtu.tree_map(lambda w: cast_to(self.scale, w) * jnp.sinh(w), w)
+
+    def contains(self, q: PyTree) -> Bool[Array, ""]:
+        return all_finite(q)
+
+    def step(self, q: PyTree, p: PyTree) -> PyTree:
+        def leaf(q, p):
+            return 2 * q * jnp.sinh(p / 2) ** 2 + self._root(q) * jnp.sinh(p)
+
+        return jtu.tree_map(leaf, q, p)
+
+    def change(self, q: PyTree, dq: PyTree) -> PyTree:
+        return _difference_change(self, q, dq)
+
+    def project(self, p: PyTree) -> PyTree:
+        return p
+
+
+class MirrorMap(AbstractMirrorMap):
+    r"""A mirror map of your own, from $h$ alone.
+
+    $\nabla h$ is by automatic differentiation and $\nabla h^*$ by root finding, unless
+    they are given.
+    """
+
+    fn: Callable
+    inverse_fn: Callable | None
+    domain: Callable | None
+    root_finder: optx.AbstractRootFinder | None
+    root_find_max_steps: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        h,
+        *,
+        inverse=None,
+        domain=None,
+        root_finder=None,
+        root_find_max_steps: int = 32,
+    ):
+        r"""**Arguments:**
+
+        - `h`: a strictly convex function `h(q)` that returns one number.
+        - `inverse`: the inverse $\nabla h^*$ of the gradient, a function `inverse(w)`.
+            Defaults to root finding.
+        - `domain`: a function `domain(q)` that returns whether `q` is inside of the
+            domain of `h`. Defaults to wherever `h(q)` is finite.
+        - `root_finder`: an Optimistix root finder, needed if `inverse` is not given. It
+            starts from the point where a step starts. Its tolerances bound how well
+            the structure is preserved. Defaults to `None`.
+        - `root_find_max_steps`: the most steps one root find may take. Defaults to 32.
+
+        **Raises:**
+
+        `ValueError` if any of these is of the wrong kind, or if neither `inverse` nor
+        `root_finder` is given. A root find that fails makes the solve fail.
+        """
+        if not callable(h):
+            raise ValueError(f"`MirrorMap(h)` needs a function `h(q)`, but got {h!r}.")
+        for name, fn in {"inverse": inverse, "domain": domain}.items():
+            if fn is not None and not callable(fn):
+                raise ValueError(f"`{name}` must be a function, but got {fn!r}.")
+        if root_finder is not None:
+            check_root_finder(root_finder)
+        elif inverse is None:
+            raise ValueError(
+                "`MirrorMap` needs the inverse of the gradient of `h`, a function "
+                "`inverse(w)`, or else a root finder to find it with, for example "
+                "`MirrorMap(h, root_finder=optimistix.Newton(rtol=1e-10, atol=1e-10))`."
+            )
+        self.fn = h
+        self.inverse_fn = inverse
+        self.domain = domain
+        self.root_finder = root_finder
+        self.root_find_max_steps = root_find_max_steps
+
+    @property
+    def is_quadratic(self) -> bool:
+        return False
+
+    def __call__(self, q: PyTree) -> Scalar:
+        return scalar_fn(self.fn, "The mirror map")(q)
+
+    def gradient(self, q: PyTree) -> PyTree:
+        return jax.grad(self.__call__)(q)
+
+    def inverse(self, w: PyTree) -> PyTree:
+        if self.inverse_fn is not None:
+            return match(self.inverse_fn(w), w, "`inverse`", "`w`")
+        return self._find(w, jtu.tree_map(jnp.ones_like, w))
+
+    def _find(self, w, guess):
+        residual = lambda q, _: tree_sub(self.gradient(q), w)
+        assert self.root_finder is not None
+        solution = optx.root_find(
+            residual,
+            self.root_finder,
+            guess,
+            max_steps=self.root_find_max_steps,
+            throw=False,
+        )
+        found = solution.result == optx.RESULTS.successful
+        return jtu.tree_map(lambda q: jnp.where(found, q, jnp.nan), solution.value)
+
+    def contains(self, q: PyTree) -> Bool[Array, ""]:
+        inside = all_finite(self(q)) if self.domain is None else self.domain(q)
+        return all_finite(q) & jnp.all(inside)
+
+    def step(self, q: PyTree, p: PyTree) -> PyTree:
+        if self.inverse_fn is not None:
+            return _difference_step(self, q, p)
+        w = jtu.tree_map(jnp.add, self.gradient(q), p)
+        return tree_sub(self._find(w, q), q)
+
+    def change(self, q: PyTree, dq: PyTree) -> PyTree:
+        return _difference_change(self, q, dq)
+
+    def project(self, p: PyTree) -> PyTree:
+        return p
+
+
+# Where nothing better is known. The difference to the image of `q` itself is exact if
+# there is no step, although `inverse(gradient(q))` may differ from `q` by rounding.
+
+
+def _difference_step(mirror_map: AbstractMirrorMap, q: PyTree, p: PyTree) -> PyTree:
+    image = mirror_map.gradient(q)
+    there = mirror_map.inverse(jtu.tree_map(jnp.add, image, p))
+    return tree_sub(there, mirror_map.inverse(image))
+
+
+def _difference_change(mirror_map: AbstractMirrorMap, q: PyTree, dq: PyTree) -> PyTree:
+    there = mirror_map.gradient(jtu.tree_map(jnp.add, q, dq))
+    return tree_sub(there, mirror_map.gradient(q))
+
+
+def _everywhere(condition: Callable, q: PyTree) -> Bool[Array, ""]:
+    held = jtu.tree_map(lambda qi: jnp.all(condition(qi)), q)
+    return jtu.tree_reduce(jnp.logical_and, held, jnp.array(True))
+
+
+def _ones_and(x: PyTree) -> tuple[PyTree, PyTree]:
+    return jtu.tree_map(jnp.ones_like, x), x

@@ -1,0 +1,461 @@
+"""Bregman dynamics: motion, structure and rates, for every mirror map and scaling."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.scipy.special as jsp
+import numpy as np
+import optimistix as optx
+import pytest
+from helpers import assert_close, flat, solve, step, trajectory
+
+import diffrax_presym as dps
+from diffrax_presym._hamiltonian._damping import _expm1
+
+
+MASS = jnp.array([[2.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 0.7]])
+SIMPLEX = dps.EntropyMirror(simplex=True)
+FINDER = optx.Newton(rtol=1e-13, atol=1e-13)
+
+
+def entropy(q):
+    return jnp.sum(q * jnp.log(q) - q)
+
+
+@dataclasses.dataclass(frozen=True)
+class Mirror:
+    """A mirror map, and its convex dual by hand."""
+
+    name: str
+    map: Any
+    dual: Callable
+
+    def __repr__(self):
+        return self.name
+
+
+MIRRORS = [
+    Mirror(
+        "euclidean",
+        dps.EuclideanMirror(MASS),
+        lambda w: w @ jnp.linalg.solve(MASS, w) / 2,
+    ),
+    Mirror("entropy", dps.EntropyMirror(), lambda w: jnp.sum(jnp.exp(w))),
+    Mirror("simplex", SIMPLEX, jsp.logsumexp),
+    Mirror(
+        "p-norm",
+        dps.PNormMirror(1.5),
+        lambda w: jnp.sum(jnp.abs(w) ** 3) ** (2 / 3) / 2,
+    ),
+    Mirror(
+        "log barrier", dps.LogBarrierMirror(), lambda w: -3.0 - jnp.sum(jnp.log(-w))
+    ),
+    Mirror(
+        "hyperbolic",
+        dps.HyperbolicMirror(0.5),
+        lambda w: 0.5 * jnp.sum(jnp.cosh(w)),
+    ),
+    Mirror(
+        "own",
+        dps.MirrorMap(entropy, root_finder=FINDER),
+        lambda w: jnp.sum(jnp.exp(w)),
+    ),
+    Mirror(
+        "own inverse",
+        dps.MirrorMap(entropy, inverse=jnp.exp),
+        lambda w: jnp.sum(jnp.exp(w)),
+    ),
+]
+NAMED = {mirror.name: mirror for mirror in MIRRORS}
+
+
+def over(*names):
+    chosen = [NAMED[name] for name in names] or MIRRORS
+    return pytest.mark.parametrize("mirror", chosen, ids=repr)
+
+
+def rising(t):
+    return 0.5 * t**2
+
+
+# exp(alpha) = t, and beta slower than it may be
+OWN_SCALING = dps.Scaling(jnp.log, lambda t: 0.4 * t**2, rising, t0=0.5, t1=4.0)
+SCALINGS = {
+    "polynomial": dps.PolynomialScaling(3.0, 0.4),
+    "exponential": dps.ExponentialScaling(0.8, 0.5),
+    "own": OWN_SCALING,
+}
+
+Q = jnp.array([0.3, 0.5, 0.2])
+P = jnp.array([0.1, -0.3, 0.2])
+T0, T1 = jnp.array(1.5), jnp.array(1.75)
+
+
+def objective(t, q, args):
+    shift = q - jnp.array([0.1, 0.3, 0.6])
+    return shift @ (MASS @ shift) / 2 + jnp.sum(q**4) / 4
+
+
+def system(mirror, scaling="polynomial", f=objective):
+    return dps.BregmanHamiltonian(mirror.map, f, SCALINGS[scaling])
+
+
+# Motion
+
+
+@pytest.mark.parametrize(
+    "mirror, scaling",
+    [
+        *((mirror, "polynomial") for mirror in MIRRORS),
+        *((NAMED["entropy"], scaling) for scaling in ("exponential", "own")),
+    ],
+    ids=str,
+)
+def test_equations_of_motion_are_those_of_the_hamiltonian(mirror, scaling):
+    law = SCALINGS[scaling]
+
+    @jax.jit
+    def hamiltonian(t, q, momentum):
+        """Equation (bregman_ham), of the canonical momentum and by the dual."""
+        alpha, beta, gamma = law.alpha(t), law.beta(t), law.gamma(t)
+        image = mirror.map.gradient(q)
+        there = image + jnp.exp(-gamma) * momentum
+        at_image = jax.grad(mirror.dual)(image) @ (there - image)
+        divergence = mirror.dual(there) - mirror.dual(image) - at_image
+        total = divergence + jnp.exp(beta) * objective(t, q, None)
+        return jnp.exp(alpha + gamma) * total
+
+    H = system(mirror, scaling)
+    momentum = H.to_canonical(T0, P)
+    assert_close(H.canonical(T0, Q, P), hamiltonian(T0, Q, momentum), 1e-14)
+    slope, velocity = jax.jit(jax.grad(hamiltonian, (1, 2)))(T0, Q, momentum)
+    dq, dp = eqx.filter_jit(dps.HamiltonianTerm(H).vf)(T0, (Q, P), None)
+    assert_close(dq, velocity, 1e-13)
+    change = H.from_canonical(T0, -slope) - law.gamma.rate(T0) * P
+    # Momenta on the simplex are defined but for a constant.
+    assert_close(dp, mirror.map.project(change), 1e-13)
+
+
+@over()
+def test_mirror_map_is_inverted(mirror):
+    image = mirror.map.gradient(Q)
+    if mirror.name != "own":
+        assert_close(mirror.map.inverse(image), Q, 1e-14)
+    there = Q + mirror.map.step(Q, P)
+    moved = mirror.map.gradient(there) - image
+    assert_close(mirror.map.project(moved), mirror.map.project(P), 1e-12)
+    assert_close(mirror.map.change(Q, there - Q), moved, 1e-14)
+    assert bool(mirror.map.contains(Q))
+    assert not bool(mirror.map.contains(Q * jnp.nan))
+
+
+def nothing(t, q, args):
+    return 0 * jnp.sum(q)
+
+
+@over()
+def test_drift_is_the_flow_without_the_objective(mirror):
+    H = system(mirror, "exponential", nothing)
+    drift = eqx.filter_jit(H.drift)
+    end = drift(T0, jnp.array(1.0), Q, P)
+    # Two drifts are one.
+    middle = drift(T0, jnp.array(0.3), Q, P)
+    assert_close(drift(T0 + 0.3, jnp.array(0.7), *middle), end, 2e-12)
+
+    @jax.jit
+    def rate(s):
+        fn = lambda s: H.drift(T0, s, Q, P)
+        return jax.jvp(fn, (s,), (jnp.ones_like(s),))
+
+    # Its rate of change is the vector field, and so it is the flow.
+    y, dy = rate(jnp.array(0.6))
+    assert_close(
+        dy, eqx.filter_jit(dps.HamiltonianTerm(H).vf)(T0 + 0.6, y, None), 1e-12
+    )
+
+
+@over("euclidean", "entropy", "simplex", "log barrier")
+def test_drift_keeps_its_digits_in_float32(mirror):
+    # A step of 1e-3 at t = 1000 moves by a few millionths.
+    H = system(mirror)
+    single = [jnp.float32(x) for x in (1e3, 1e-3, Q, P)]
+    double = [x.astype(jnp.float64) for x in single]
+    t, h, q, p = single
+    move = -_expm1(-H.damping.increment(t, h)) * H.mirror_map.step(q, p)
+    (q1, p1), (q64, p64) = H.drift(*single), H.drift(*double)
+    assert q1.dtype == p1.dtype == jnp.float32
+    assert_close(np.float64(move) / (q64 - double[2]), np.ones(3), 1e-6)
+    assert_close(q1, q64, 1e-7)
+    assert_close(np.float64(p1) / p64, np.ones(3), 1e-6)
+
+
+# Schemes
+
+EXPLICIT = {
+    "strang": (dps.Strang(), 2),
+    "suzuki": (dps.Suzuki4(dps.Strang()), 4),
+    "blanes-moan 4": (dps.BlanesMoan4(), 4),
+    "blanes-moan 6": (dps.BlanesMoan6(), 6),
+}
+
+
+@functools.cache
+def exact_end(mirror):
+    # By a method that knows nothing of the drift.
+    H = system(NAMED[mirror])
+    return flat(solve(H, dfx.Dopri8(), 1.0, 2.0, 1 / 64, (Q, P)).ys)
+
+
+@pytest.mark.parametrize(
+    "mirror, scheme",
+    [*(("entropy", scheme) for scheme in EXPLICIT), ("simplex", "blanes-moan 4")],
+)
+def test_order_of_splittings(mirror, scheme):
+    H = system(NAMED[mirror])
+    solver, order = EXPLICIT[scheme]
+    steps = {2: [32, 64], 4: [16, 32], 6: [6, 9]}[order]
+    ends = [flat(solve(H, solver, 1.0, 2.0, 1 / n, (Q, P)).ys) for n in steps]
+    errors = [np.max(np.abs(end - exact_end(mirror))) for end in ends]
+    measured = np.log(errors[0] / errors[1]) / np.log(steps[1] / steps[0])
+    assert abs(measured - order) < 0.3
+
+
+# The tangents of the simplex: what sums to zero.
+TANGENT = np.array([[1, -1, 0], [1, 1, -2]]).T / np.sqrt([2, 6])
+
+
+@eqx.filter_jit
+def jacobian(H, solver, basis):
+    def one_step(x):
+        n = basis.shape[1]
+        y = (Q + basis @ x[:n], P + basis @ x[n:])
+        q, p = step(H, solver, T0, T1, y)[0]
+        return jnp.concatenate([basis.T @ q, basis.T @ p])
+
+    return jax.jacfwd(one_step)(jnp.zeros(2 * basis.shape[1]))
+
+
+@pytest.mark.parametrize("scheme", ["strang", "blanes-moan 4"])
+@over("entropy", "simplex", "p-norm", "log barrier", "own")
+def test_form_contracts_with_the_scaling(mirror, scheme):
+    basis = TANGENT if mirror.name == "simplex" else np.eye(3)
+    J = np.asarray(jacobian(system(mirror), EXPLICIT[scheme][0], jnp.array(basis)))
+    n = basis.shape[1]
+    form = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
+    contraction = float((T0 / T1) ** 3)
+    tolerance = 1e-12 if mirror.name == "own" else 5e-14
+    assert np.max(np.abs(J.T @ form @ J - contraction * form)) < tolerance
+
+
+@over()
+def test_a_step_backwards_undoes_a_step_of_a_splitting(mirror):
+    H, solver = system(mirror), dps.Strang()
+    there = step(H, solver, T0, T1, (Q, P))[0]
+    back = step(H, solver, T1, T0, there)[0]
+    assert_close(back, (Q, P), 1e-13)
+
+
+def test_quadratic_case_is_the_separable_one():
+    c, C = 3.0, 0.4
+    bregman = system(NAMED["euclidean"])
+    separable = dps.DissipativeHamiltonian(
+        dps.QuadraticKinetic(MASS / c),
+        lambda t, q, args: c * C * objective(t, q, args),
+        eta1=dps.LogDamping(c + 1),  # gamma - alpha
+        eta2=dps.LogDamping(2 * c - 1),  # alpha + beta + gamma
+    )
+    start = separable.from_canonical(T0, bregman.to_canonical(T0, P))
+    for solver in (
+        dps.PresymplecticLeapfrog(),
+        dps.PresymplecticYoshida4("position"),
+        dps.BlanesMoanRKN4(),
+    ):
+        _, q, p = trajectory(bregman, solver, T0, T0 + 2, 0.1, (Q, P))
+        t, q2, p2 = trajectory(separable, solver, T0, T0 + 2, 0.1, (Q, start))
+        assert_close(q, q2, 1e-13)
+        # In the frames of gamma and of eta2.
+        momenta = jax.vmap(bregman.to_canonical)(t, p)
+        assert_close(momenta, jax.vmap(separable.to_canonical)(t, p2), 1e-13)
+
+
+def beyond_a_corner(t, q, args):
+    return jnp.sum((q - jnp.array([[1.5, 0, -0.5]], q.dtype)) ** 2)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_positions_stay_on_the_simplex(dtype):
+    H = dps.BregmanHamiltonian(SIMPLEX, beyond_a_corner, dps.PolynomialScaling(2.0))
+    q0 = jnp.array([[0.3, 0.5, 0.2], [0.1, 0.1, 0.8]], dtype)
+    t0, t1, dt0 = (dtype(x) for x in (0.25, 30.25, 1 / 32))
+    y0, saveat = (q0, jnp.zeros_like(q0)), dfx.SaveAt(steps=True)
+    sol = solve(H, dps.Strang(), t0, t1, dt0, y0, saveat=saveat, max_steps=960)
+    assert sol.ys is not None
+    q, p = sol.ys
+    assert q.dtype == dtype and np.all(np.isfinite(q)) and np.all(q > 0)
+    eps = np.finfo(dtype).eps
+    assert np.max(np.abs(q.sum(-1) - 1)) < 32 * eps
+    assert np.max(np.abs(p.sum(-1))) < 64 * eps * np.max(np.abs(p))
+    assert np.all(q[-1, :, 0] > 0.99)
+
+
+# Rates. With f(q) = exp(-q) the motion is known: q = beta(t), p = 1, so f = exp(-beta).
+
+
+def falling(t, q, args):
+    return jnp.sum(jnp.exp(-q))
+
+
+RATES = {
+    "c = 2": dps.PolynomialScaling(2.0),
+    "c = 4": dps.PolynomialScaling(4.0, 0.3),
+    "exponential": dps.ExponentialScaling(1.0),
+    "own": OWN_SCALING,
+}
+
+
+@pytest.mark.parametrize("rate", RATES)
+def test_objective_falls_like_exp_of_beta(rate):
+    scaling = RATES[rate]
+    H = dps.BregmanHamiltonian(dps.EuclideanMirror(), falling, scaling)
+    if rate == "own":
+        # It falls short of the optimal rate.
+        H = eqx.tree_at(
+            lambda H: H.scaling,
+            H,
+            dps.Scaling(jnp.log, rising, rising, t0=0.5, t1=4.0),
+        )
+    beta = jax.vmap(H.scaling.beta)
+    y0 = (H.scaling.beta(jnp.array([1.0])), jnp.ones(1))
+    t, q, p = trajectory(H, dps.BlanesMoan4(), 1.0, 3.0, 0.05, y0)
+    assert_close(q[:, 0], beta(jnp.array(t)), 1e-6)
+    assert_close(p, np.ones_like(p), 1e-6)
+    gap = jax.vmap(lambda t, q: falling(t, q, None))(t, q)
+    assert_close(np.log(gap), -beta(jnp.array(t)), 1e-6)
+
+
+# What is refused, and what fails
+
+
+@pytest.mark.parametrize(
+    "functions, condition, time",
+    [
+        ((jnp.log, rising, lambda t: t), "gamma'", 0.5),
+        ((jnp.log, lambda t: t**3 / 6, rising), "beta'", 2.0),
+    ],
+)
+def test_violated_scaling_conditions_are_an_error_with_the_time(
+    functions, condition, time
+):
+    with pytest.raises(ValueError, match=f"{condition}.*violated at t = ") as error:
+        dps.Scaling(*functions, t0=0.5, t1=4.0)
+    found = float(str(error.value).split("t = ")[1].split(":")[0])
+    assert time <= found <= time + 0.01
+
+
+def test_violated_scaling_conditions_fail_a_solve():
+    # They hold on the interval that was checked, and not beyond.
+    scaling = dps.Scaling(jnp.log, lambda t: t**3 / 6, rising, t0=0.5, t1=1.9)
+    H = dps.BregmanHamiltonian(dps.EuclideanMirror(), objective, scaling)
+    good = solve(H, dps.Strang(), 1.0, 1.9, 0.1, (Q, P), throw=False)
+    assert good.result == dfx.RESULTS.successful
+    bad = solve(H, dps.Strang(), 1.0, 2.5, 0.1, (Q, P), throw=False)
+    assert bad.result != dfx.RESULTS.successful
+    assert bad.stats["num_steps"] == 11
+
+
+def failing(mirror_map, solver, q, p, h=0.5):
+    H = dps.BregmanHamiltonian(mirror_map, objective, dps.PolynomialScaling(2.0))
+    return solve(H, solver, 1.0, 1.0 + 4 * h, h, (q, p), throw=False)
+
+
+@pytest.mark.parametrize(
+    "mirror_map, q, p",
+    [
+        # Beyond the dual domain, outside of the domain, and too far for Newton.
+        (dps.LogBarrierMirror(), Q, 10 + P),
+        (dps.EntropyMirror(), -Q, P),
+        (dps.EntropyMirror(), Q, 1e4 + P),
+        (dps.MirrorMap(entropy, root_finder=FINDER), Q, P - 30),
+        (dps.EuclideanMirror(), jnp.nan * Q, P),
+    ],
+)
+def test_leaving_the_domain_is_a_result(mirror_map, q, p):
+    sol = failing(mirror_map, dps.Strang(), q, p)
+    assert sol.result != dfx.RESULTS.successful
+    assert sol.stats["num_steps"] == 1
+    good = failing(mirror_map, dps.Strang(), Q, P / 10, h=0.01)
+    assert good.result == dfx.RESULTS.successful
+
+
+def test_time_zero_is_a_result():
+    H = system(NAMED["entropy"])
+    sol = solve(H, dps.BlanesMoan4(), -0.1, 0.5, 0.05, (Q, P), throw=False)
+    assert sol.result != dfx.RESULTS.successful
+
+
+def test_frozen_drifts_are_implicit_and_say_what_is_not():
+    with pytest.raises(ValueError, match=r"BregmanHamiltonian.*`Strang\(\)`"):
+        solve(
+            system(NAMED["entropy"]), dps.PresymplecticLeapfrog(), T0, T1, 0.1, (Q, P)
+        )
+    with pytest.raises(ValueError, match="quadratic"):
+        solve(system(NAMED["entropy"]), dps.BlanesMoanRKN4(), T0, T1, 0.1, (Q, P))
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: dps.BregmanHamiltonian(entropy, objective, SCALINGS["own"]), "Mirr"),
+        (lambda: dps.BregmanHamiltonian(SIMPLEX, 1.0, SCALINGS["own"]), "objective"),
+        (lambda: dps.BregmanHamiltonian(SIMPLEX, objective, rising), "Scaling"),
+        (lambda: dps.PolynomialScaling(-1.0), "positive"),
+        (lambda: dps.ExponentialScaling(1.0, 0.0), "positive"),
+        (lambda: dps.PNormMirror(3.0), "at most 2"),
+        (lambda: dps.HyperbolicMirror(0.0), "positive"),
+        (lambda: dps.MirrorMap(entropy), "root finder"),
+        (lambda: dps.MirrorMap(1.0), "needs a function"),
+        (lambda: dps.MirrorMap(entropy, inverse=1.0), "`inverse` must be"),
+        (lambda: dps.Scaling(1.0, rising, rising, t0=0, t1=1), "`alpha`"),
+    ],
+)
+def test_bad_parts_are_an_error(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+# Gradients
+
+
+def from_parameters(theta):
+    """A number for the mirror map, and two for the scaling."""
+    shape, c, C = theta
+    return {
+        "euclidean": dps.EuclideanMirror(shape),
+        "p-norm": dps.PNormMirror(shape),
+        "hyperbolic": dps.HyperbolicMirror(shape),
+    }, dps.PolynomialScaling(c, C)
+
+
+@pytest.mark.parametrize("name", ["euclidean", "p-norm", "hyperbolic"])
+def test_gradients_of_mirror_maps_and_scalings(name):
+    @jax.jit
+    def loss(theta):
+        mirrors, scaling = from_parameters(theta)
+        H = dps.BregmanHamiltonian(mirrors[name], objective, scaling)
+        term = dps.HamiltonianTerm(H)
+        sol = dfx.diffeqsolve(term, dps.Strang(), 1.0, 2.0, 0.125, (Q, P), max_steps=16)
+        assert sol.ys is not None
+        return jnp.sum(jnp.sin(flat(sol.ys)))
+
+    theta = jnp.array([1.4, 2.5, 0.6])
+    gradient = jax.jit(jax.grad(loss))(theta)
+    assert np.all(np.abs(gradient) > 1e-3)
+    for i, e in enumerate(1e-5 * np.eye(3)):
+        difference = (loss(theta + e) - loss(theta - e)) / 2e-5
+        assert abs(gradient[i] - difference) < 1e-8
