@@ -15,8 +15,10 @@ import diffrax_presym as dps
 class Problem:
     name: str
     hamiltonian: dps.AbstractHamiltonian
-    # The right-hand side `rhs(t, q, p)` in NumPy, in the precision of its arguments.
+    # The right-hand side `rhs(t, q, p)` in NumPy, in the precision of its arguments,
+    # and the increment of the log scale from `t` to `t + h`.
     rhs: Callable
+    increment: Callable
     q0: Any
     p0: Any
     t1: float
@@ -40,6 +42,7 @@ def pendulum():
         "damped pendulum",
         conformal(lambda t, q, args: -jnp.sum(jnp.cos(q)), dps.ConstantDamping(gamma)),
         lambda t, q, p: (p, -np.sin(q) - gamma * p),
+        lambda t, h: gamma * h,
         np.array([2.0]),
         np.array([0.0]),
         100.0,
@@ -52,6 +55,7 @@ def decaying():
         "decaying oscillator",
         conformal(lambda t, q, args: jnp.sum(q**2) / 2, dps.LogDamping(gamma, 1.0)),
         lambda t, q, p: (p, -q - gamma / (t + 1) * p),
+        lambda t, h: gamma * math.log1p(h / (t + 1)),
         np.array([1.0]),
         np.array([0.0]),
         100.0,
@@ -74,6 +78,7 @@ def henon_heiles():
         "damped Henon-Heiles",
         conformal(potential, dps.ConstantDamping(gamma)),
         rhs,
+        lambda t, h: gamma * h,
         np.array([0.1, -0.3]),
         np.array([0.3, 0.1]),
         100.0,
@@ -93,6 +98,7 @@ def kepler():
             lambda t, q, args: -1 / jnp.sqrt(jnp.sum(q**2)), dps.ConstantDamping(gamma)
         ),
         rhs,
+        lambda t, h: gamma * h,
         np.array([1 - e, 0.0]),
         np.array([0.0, math.sqrt((1 + e) / (1 - e))]),
         20 * math.pi,
@@ -118,6 +124,7 @@ def chain(n=100):
         f"chain of {n}",
         conformal(potential, dps.ConstantDamping(gamma)),
         rhs,
+        lambda t, h: gamma * h,
         np.sin(2 * np.pi * np.arange(n) / n),
         np.zeros(n),
         50.0,
@@ -134,6 +141,7 @@ def relativistic():
             dps.RelativisticKinetic(),
         ),
         lambda t, q, p: (p / np.sqrt(np.sum(p**2) + 1), -q - gamma * p),
+        lambda t, h: gamma * h,
         np.array([2.0]),
         np.array([0.0]),
         100.0,
@@ -169,6 +177,7 @@ def random_quadratic(n=1000, m=1250):
             force=lambda t, q, args: -(matrix @ q),
         ),
         rhs,
+        lambda t, h: gamma * h,
         np.ones(n),
         np.zeros(n),
         t1,

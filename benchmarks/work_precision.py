@@ -1,12 +1,12 @@
-"""Time to reach an error: our schemes beside Diffrax's, SciPy's and heyoka's.
+"""Time to reach an error: our schemes beside Diffrax's, and others from outside JAX.
 
 For each problem every method is run over a sweep of step sizes or tolerances, in one
 process, compiled and warmed up, all by turns. A point is the median time and the error
 of the solution at the final time: the largest entry, relative to that of the solution,
 since damping shrinks both, against a reference better than 1e-14. Tables give the time
 to reach an error, read off each method's curve, and the geometric mean over the
-problems of (best Diffrax solver) / (our best). The picture goes to `docs/img/`. heyoka
-and SciPy are measured if they are installed.
+problems of (best Diffrax solver) / (our best). The picture goes to `docs/img/`. SciPy,
+heyoka, pyhamsys and symplecta are measured if they are installed.
 """
 
 import argparse
@@ -23,7 +23,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import problems
 from matplotlib.lines import Line2D
-from outside import heyoka_runs, scipy_runs
+from outside import heyoka_runs, pyhamsys_runs, scipy_runs, STEPS, symplecta_runs
 
 import diffrax_presym as dps
 
@@ -128,6 +128,8 @@ def all_runs(problem, quick):
     tolerances = TOLERANCES[1::4] if quick else TOLERANCES
     runs += heyoka_runs(problem, tolerances)
     runs += scipy_runs(problem, tolerances[::2])
+    steps = STEPS[:2] if quick else STEPS
+    runs += pyhamsys_runs(problem, steps) + symplecta_runs(problem, steps)
     return runs
 
 
