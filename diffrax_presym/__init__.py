@@ -1,5 +1,6 @@
 """Presymplectic integrators for Diffrax."""
 
+from . import diagnostics as diagnostics
 from ._hamiltonian import (
     AbstractDamping as AbstractDamping,
     AbstractHamiltonian as AbstractHamiltonian,
@@ -49,6 +50,13 @@ from ._solver import (
     Substeps as Substeps,
     Suzuki4 as Suzuki4,
     SuzukiYoshida as SuzukiYoshida,
+)
+from ._step_density import (
+    ArclengthDensity as ArclengthDensity,
+    DistanceDensity as DistanceDensity,
+    pair_distances as pair_distances,
+    power_grid as power_grid,
+    StepDensityController as StepDensityController,
 )
 from ._term import HamiltonianTerm as HamiltonianTerm
 

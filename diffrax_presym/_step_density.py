@@ -1,0 +1,279 @@
+from collections.abc import Callable
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Inexact, PyTree
+
+from ._misc import as_parameter, as_positive, cast_to, describe, tree_dot
+from ._term import HamiltonianTerm
+
+
+Scalar = Inexact[Array, ""]
+
+
+class DistanceDensity(eqx.Module):
+    r"""Steps by distance, $\sigma = \big( \sum_k r_k^{-2s} \big)^{-1/2}$.
+
+    With one distance this is $\sigma = r^s$. For attraction that grows without bound as
+    bodies approach each other: with $s = 3/2$, by Kepler's third law, a close encounter
+    takes as many steps as a distant one. It takes no force evaluation.
+    """
+
+    power: Scalar
+    distances: Callable[[PyTree], Array]
+
+    def __init__(self, power: ArrayLike = 1.5, distances: Callable | None = None):
+        r"""**Arguments:**
+
+        - `power`: the exponent $s$, a positive number. Defaults to 3/2.
+        - `distances`: a function `distances(q)` that returns an array of all distances
+            that matter. Defaults to that from the origin, over the last axis of `q`.
+            For bodies that attract each other it is that of all pairs,
+            [`diffrax_presym.pair_distances`][].
+
+        **Raises:**
+
+        `ValueError` if the power is known not to be positive.
+        """
+        self.power = as_positive(power, "`DistanceDensity(power)`")
+        self.distances = _from_origin if distances is None else distances
+
+    def __call__(self, t, y, args):
+        logs = jnp.log(self.distances(y[0]))
+        power = cast_to(self.power, logs)
+        return jnp.exp(-jax.nn.logsumexp(-2 * power * logs) / 2)
+
+
+def _from_origin(q):
+    return jnp.linalg.norm(jnp.atleast_1d(q), axis=-1)
+
+
+def pair_distances(q: Inexact[Array, "bodies space"]) -> Inexact[Array, " pairs"]:
+    """The distances between all pairs of bodies, for
+    [`diffrax_presym.DistanceDensity`][].
+
+    **Arguments:**
+
+    - `q`: the positions, an array of shape `(bodies, space)`.
+
+    **Returns:**
+
+    An array with an entry for each pair.
+    """
+    i, j = jnp.triu_indices(q.shape[0], 1)
+    return jnp.linalg.norm(q[i] - q[j], axis=-1)
+
+
+class ArclengthDensity(eqx.Module):
+    r"""Steps of equal length in phase space, $\sigma = |(\dot q, \dot p)|^{-1}$.
+
+    For motion that is slow here and fast there, without any knowledge of where; `q` and
+    `p` should be of similar size. It takes one force evaluation per step, and its
+    derivative along the motion.
+    """
+
+    term: HamiltonianTerm
+
+    def __init__(self, term: HamiltonianTerm):
+        """**Arguments:**
+
+        - `term`: the term of the solve.
+
+        **Raises:**
+
+        `ValueError` if the term is no [`diffrax_presym.HamiltonianTerm`][].
+        """
+        self.term = _as_term(term, "ArclengthDensity")
+
+    def __call__(self, t, y, args):
+        slope = self.term.vf(t, y, args)
+        return jax.lax.rsqrt(tree_dot(slope, slope))
+
+
+class StepDensityController(dfx.AbstractStepSizeController):
+    r"""Steps by the state, $h \approx \epsilon \sigma(t, y)$, that are reversible.
+
+    A step that is chosen by an error estimate destroys what a symmetric scheme is for:
+    its energy error grows with time again. Here the logarithm of the step is integrated
+    along with the motion,
+
+    $$z_{n+1/2} = z_{n-1/2} - \epsilon \sigma \frac{\mathrm d}{\mathrm dt} \log \sigma,
+    \qquad h_{n+1/2} = \epsilon e^{-z_{n+1/2}},$$
+
+    with $\sigma$ and its derivative along the motion taken at step $n$, half of it in
+    the first step from $z_0 = -\log \sigma(t_0, y_0)$. A solve that is run backwards
+    from its end then takes the same steps, and energy errors stay bounded as with
+    constant steps. No step is ever rejected, and none is negative.
+
+    For motion that is very uneven, such as close encounters; with every symmetric
+    scheme of this package and with any solver of Diffrax. Not for a smooth motion,
+    where constant steps are cheaper. Works with `dt0=None` alone; a solve fails with
+    `RESULTS.dt_min_reached` if a step vanishes or is not finite.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{hairer2005explicit,
+            author={Hairer, Ernst and S{\"o}derlind, Gustaf},
+            title={Explicit, time reversible, adaptive step size control},
+            journal={SIAM Journal on Scientific Computing},
+            volume={26},
+            number={6},
+            pages={1838--1851},
+            year={2005},
+        }
+        ```
+    """
+
+    term: HamiltonianTerm
+    epsilon: Scalar
+    density: Callable
+    direction: ArrayLike
+
+    def __init__(self, term: HamiltonianTerm, epsilon: ArrayLike, density: Callable):
+        r"""**Arguments:**
+
+        - `term`: the term of the solve, of which the derivative along the motion is
+            taken.
+        - `epsilon`: the step size $\epsilon$ where the density is one; a positive
+            number, in units of time if the density has none.
+        - `density`: the step density $\sigma$, a function `density(t, y, args)` that
+            returns one positive number; for example
+            [`diffrax_presym.DistanceDensity`][].
+
+        **Raises:**
+
+        `ValueError` if `epsilon` is known not to be positive, if the term is no
+        [`diffrax_presym.HamiltonianTerm`][], and when the solve is traced if `dt0` is
+        given or the density is no number.
+        """
+        self.term = _as_term(term, "StepDensityController")
+        self.epsilon = as_positive(epsilon, "`StepDensityController(epsilon=...)`")
+        if not callable(density):
+            raise ValueError(
+                "`StepDensityController(density=...)` must be a function `density(t, "
+                f"y, args)`, but got {density!r}. Write for example "
+                "`DistanceDensity()`."
+            )
+        self.density = density
+        self.direction = 1
+
+    def wrap(self, direction):
+        return eqx.tree_at(lambda self: self.direction, self, direction)
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        if dt0 is not None:
+            raise ValueError(
+                "`StepDensityController` chooses the first step too. Write "
+                "`diffeqsolve(..., dt0=None)`, and scale all steps by its `epsilon`."
+            )
+        log_density, change = self._density(t0, y0, args)
+        z = change / 2 - log_density
+        return t0 + self.step_size(z), z
+
+    def adapt_step_size(
+        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+    ):
+        _, change = self._density(t1, y1_candidate, args)
+        z = controller_state + change
+        t2 = t1 + self.step_size(z)
+        moves = jnp.isfinite(t2) & (t2 > t1)
+        result = dfx.RESULTS.where(
+            moves, dfx.RESULTS.successful, dfx.RESULTS.dt_min_reached
+        )
+        return True, t1, t2, False, z, result
+
+    def step_size(self, controller_state):
+        """The size of the next step.
+
+        To continue a solve pass it as `dt0`, beside its `controller_state`.
+
+        **Arguments:**
+
+        - `controller_state`: the state at the end of a solve, from
+            `SaveAt(controller_state=True)`.
+        """
+        z = controller_state
+        return cast_to(self.epsilon, z) * jnp.exp(-z)
+
+    def reverse(self, t, y, args, controller_state):
+        """The `controller_state` with which a solve goes back the way it came.
+
+        **Arguments:**
+
+        - `t`, `y`: the time and state at the end of the solve.
+        - `args`: as in `diffeqsolve`.
+        - `controller_state`: the state at the end of the solve, from
+            `SaveAt(controller_state=True)`.
+        """
+        return controller_state - self._density(t, y, args)[1]
+
+    def _density(self, t, y, args):
+        r"""$\log \sigma$, and by how much $z$ changes in a step."""
+        t = jnp.asarray(t)
+
+        def log_density(t, y):
+            sigma = self.density(self.direction * t, y, args)
+            if jnp.shape(sigma) != () or not jnp.isrealobj(sigma):
+                raise ValueError(
+                    "The density of `StepDensityController` must return one real "
+                    f"number, but returned {describe(sigma)}. Write for example "
+                    "`lambda t, y, args: jnp.linalg.norm(y[0]) ** 1.5`."
+                )
+            return jnp.log(cast_to(sigma, t))
+
+        slope = self.term.vf(self.direction * t, y, args)
+        slope = jax.tree.map(lambda dy: cast_to(self.direction, dy) * dy, slope)
+        value, rate = jax.jvp(log_density, (t, y), (jnp.ones_like(t), slope))
+        return value, -cast_to(self.epsilon, t) * jnp.exp(value) * rate
+
+
+def power_grid(t0: ArrayLike, t1: ArrayLike, steps: int, power: ArrayLike) -> Array:
+    r"""Times $t = \tau^k$ for equal steps in $\tau$, for `diffrax.StepTo`.
+
+    For motion whose frequency is a power of time, such as Bregman dynamics with
+    [`diffrax_presym.PolynomialScaling`][]: there it grows like $t^{c/2-1}$, and the
+    power $k = 2/c$ makes as many steps in every period. A grid is reversible.
+
+    **Arguments:**
+
+    - `t0`, `t1`: the first and the last time, not negative.
+    - `steps`: the number of steps, a positive integer.
+    - `power`: the power $k$, a positive number.
+
+    **Returns:**
+
+    An array of `steps + 1` times.
+
+    **Raises:**
+
+    `ValueError` if the number of steps or the power is not positive, or a time is known
+    to be negative.
+    """
+    if not isinstance(steps, int) or steps < 1:
+        raise ValueError(
+            f"`power_grid(steps=...)` must be a positive integer, but got {steps!r}."
+        )
+    power = as_positive(power, "`power_grid(power=...)`")
+    t0, t1 = (as_parameter(t, "`power_grid(t0, t1)`") for t in (t0, t1))
+    for t in (t0, t1):
+        if not isinstance(t, Tracer) and t < 0:
+            raise ValueError(
+                f"`power_grid` needs times that are not negative, but got {t}. Powers "
+                "of negative times are not real."
+            )
+    tau = jnp.linspace(t0 ** (1 / power), t1 ** (1 / power), steps + 1)
+    # The ends themselves, whatever the rounding.
+    return (tau**power).at[jnp.array([0, -1])].set(jnp.stack([t0, t1]))
+
+
+def _as_term(term, name: str) -> HamiltonianTerm:
+    if not isinstance(term, HamiltonianTerm):
+        raise ValueError(
+            f"`{name}` needs the term of the solve, a `HamiltonianTerm`, but got "
+            f"{term!r}. Write `{name}(term, ...)`."
+        )
+    return term

@@ -1,0 +1,208 @@
+"""What a solution is worth: energy, structure and order, measured."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Inexact, PyTree
+
+from ._misc import tree_dot
+from ._term import HamiltonianTerm, State
+
+
+Times = Inexact[Array, " times"]
+
+
+def energy(term: HamiltonianTerm, ts: Times, ys: State, args: PyTree = None) -> Times:
+    r"""The mechanical energy $E(t, q, p)$ at each of the times that were saved.
+
+    **Arguments:**
+
+    - `term`: the term of the solve.
+    - `ts`, `ys`: times and states, the `ts` and `ys` of a `diffrax.Solution`.
+    - `args`: as in `diffeqsolve`.
+
+    **Returns:**
+
+    An array with an entry for each time. Where nothing was saved (`ts` is infinite
+    beyond the last step of `SaveAt(steps=True)`) it is not finite either.
+    """
+    return _at_each(lambda t, y: term.hamiltonian.energy(t, *y, args), ts, ys)
+
+
+def canonical_energy(
+    term: HamiltonianTerm, ts: Times, ys: State, args: PyTree = None
+) -> Times:
+    r"""The canonical energy $H = e^{\eta(t)} E(t, q, p)$, that of the paper.
+
+    It overflows where $e^{\eta}$ does.
+
+    **Arguments:**
+
+    As [`diffrax_presym.diagnostics.energy`][].
+    """
+
+    return _at_each(lambda t, y: term.hamiltonian.canonical(t, *y, args), ts, ys)
+
+
+def energy_error(
+    term: HamiltonianTerm, ts: Times, ys: State, args: PyTree = None
+) -> Times:
+    r"""By how much the energy balance is violated, at each of the times saved.
+
+    Along the exact motion the extended Hamiltonian is constant: energy changes only by
+    what damping takes and what is done by forces that depend on time,
+
+    $$E(t) - E(t_0) = \int_{t_0}^t \Big( \frac{\partial E}{\partial t}
+    - \dot \eta \, p \cdot \frac{\partial E}{\partial p} \Big) \, \mathrm d t.$$
+
+    The error is the left side less the right, whose integral is taken over the states
+    saved, to fourth order in the distance of their times: save every step, or often.
+
+    **Arguments:**
+
+    As [`diffrax_presym.diagnostics.energy`][].
+    """
+    hamiltonian = term.hamiltonian
+
+    def power(t, y):
+        q, p = y
+        explicit = jax.grad(lambda t: hamiltonian.energy(t, q, p, args))(t)
+        if hamiltonian.damping is None:
+            return explicit
+        lost = tree_dot(p, hamiltonian.velocity(t, q, p, args))
+        return explicit - hamiltonian.damping.rate(t) * lost
+
+    def with_slope(t, y):
+        return jax.jvp(power, (t, y), (jnp.ones_like(t), term.vf(t, y, args)))
+
+    ts = jnp.asarray(ts)
+    values, slopes = _at_each(with_slope, ts, ys)
+    # The trapezoidal rule and its first correction.
+    h = jnp.diff(ts)
+    trapezoid = h * (values[1:] + values[:-1]) / 2
+    parts = trapezoid + h**2 / 12 * (slopes[:-1] - slopes[1:])
+    balance = energy(term, ts, ys, args)
+    return balance - balance[0] - jnp.concatenate([0 * h[:1], jnp.cumsum(parts)])
+
+
+def _at_each(fn, ts, ys):
+    return eqx.filter_jit(jax.vmap(fn))(jnp.asarray(ts), ys)
+
+
+def structure_defect(
+    term: HamiltonianTerm,
+    solver: dfx.AbstractSolver,
+    t0,
+    t1,
+    y: State,
+    args: PyTree = None,
+) -> Inexact[Array, ""]:
+    r"""By how much one step fails to be conformally symplectic.
+
+    The largest entry of $J^T \Omega J - e^{\eta(t_0) - \eta(t_1)} \Omega$, where $J$ is
+    the Jacobian of the step: zero to rounding for the schemes of this package. Those
+    with two copies of the system are so in the space of both; for these `y` alone is
+    not all of the state, and its defect is small and not zero.
+
+    **Arguments:**
+
+    - `term`, `solver`: the term, and any solver that takes it.
+    - `t0`, `t1`: the start and the end of the step.
+    - `y`: the state `(q, p)` at the start.
+    - `args`: as in `diffeqsolve`.
+    """
+    return _structure_defect(term, solver, jnp.asarray(t0), jnp.asarray(t1), y, args)
+
+
+@eqx.filter_jit
+def _structure_defect(term, solver, t0, t1, y, args):
+    start, unravel = ravel_pytree(y)
+
+    def end(x):
+        y = unravel(x)
+        carry = solver.init(term, t0, t1, y, args)
+        y1, *_ = solver.step(term, t0, t1, y, args, carry, made_jump=False)
+        return ravel_pytree(y1)[0]
+
+    n = start.size // 2
+    form = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
+    damping = term.hamiltonian.damping
+    lost = jnp.zeros_like(t0) if damping is None else damping.increment(t0, t1 - t0)
+    # By reverse mode, which Diffrax's own solvers have.
+    jacobian = jax.jacrev(end)(start)
+    product = jnp.matmul(jacobian.T, form @ jacobian, precision="highest")
+    return jnp.max(jnp.abs(product - jnp.exp(-lost) * form))
+
+
+def convergence_order(
+    term: HamiltonianTerm,
+    solver: dfx.AbstractSolver,
+    t0,
+    t1,
+    y0: State,
+    steps: int,
+    args: PyTree = None,
+) -> Inexact[Array, ""]:
+    r"""The order of a solver as measured: of solves with once, twice and four times as
+    many steps, $\log_2 (|y_h - y_{h/2}| / |y_{h/2} - y_{h/4}|)$.
+
+    It is near the order of the scheme where steps are small enough for the error to be
+    one term, and large enough for it not to be rounding.
+
+    **Arguments:**
+
+    - `term`, `solver`: the term, and any solver that takes it.
+    - `t0`, `t1`: the start and the end of the solves.
+    - `y0`: the state `(q, p)` at the start.
+    - `steps`: the number of steps of the coarsest solve.
+    - `args`: as in `diffeqsolve`.
+
+    **Raises:**
+
+    `ValueError` if `steps` is not a positive integer.
+    """
+    if not isinstance(steps, int) or steps < 1:
+        raise ValueError(
+            f"`convergence_order(steps=...)` must be a positive integer, got {steps!r}."
+        )
+    t0, t1 = jnp.asarray(t0, float), jnp.asarray(t1, float)
+    coarse, middle, fine = (
+        _end(term, solver, t0, t1, (t1 - t0) / (k * steps), y0, args) for k in (1, 2, 4)
+    )
+    distance = lambda x, y: jnp.linalg.norm(x - y)
+    return jnp.log2(distance(coarse, middle) / distance(middle, fine))
+
+
+@eqx.filter_jit
+def _end(term, solver, t0, t1, dt0, y0, args):
+    sol = dfx.diffeqsolve(term, solver, t0, t1, dt0, y0, args, max_steps=None)
+    return ravel_pytree(jtu.tree_map(lambda y: y[-1], sol.ys))[0]
+
+
+def copy_distance(solver, y: State, solver_state) -> Inexact[Array, ""]:
+    """The largest difference between the two copies of the system that a scheme for
+    nonseparable Hamiltonians keeps.
+
+    It should stay of the size of the error. Copies that part are a sign of steps that
+    are too large, or of a coupling too weak or in resonance with the step.
+
+    **Arguments:**
+
+    - `solver`: the solver, for example [`diffrax_presym.PresymplecticTao`][].
+    - `y`: the state at the end of a solve.
+    - `solver_state`: the solver state there, from `SaveAt(t1=True, solver_state=True)`.
+
+    **Raises:**
+
+    `ValueError` if the solver keeps no copies.
+    """
+    if not hasattr(solver, "distance"):
+        raise ValueError(
+            f"`{type(solver).__name__}` keeps no copies of the system, so there is no "
+            "distance between them. Use `PresymplecticTao()`, for example."
+        )
+    return solver.distance(y, solver_state)

@@ -1,0 +1,83 @@
+"""The measures that users are given, against what is known."""
+
+import diffrax as dfx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, harmonic, oscillator, pendulum, solve
+
+import diffrax_presym as dps
+from diffrax_presym import diagnostics
+
+
+Y0 = (jnp.array([1.0]), jnp.array([0.3]))
+TERM = dps.HamiltonianTerm(oscillator(0.2))
+
+
+def driven(t, q, args):
+    return pendulum(t, q, args) + args * jnp.sin(t) * jnp.sum(q)
+
+
+DRIVEN = dps.HamiltonianTerm(
+    dps.ConformalHamiltonian(dps.QuadraticKinetic(), driven, dps.LogDamping(2.0))
+)
+
+
+def test_energies():
+    ts, ys = (
+        jnp.array([0.0, 3.0]),
+        (jnp.array([[1.0], [2.0]]), jnp.array([[0.0], [1.0]])),
+    )
+    assert_close(diagnostics.energy(TERM, ts, ys), jnp.array([0.5, 2.5]), 1e-15)
+    canonical = jnp.array([0.5, 2.5 * np.exp(0.6)])
+    assert_close(diagnostics.canonical_energy(TERM, ts, ys), canonical, 1e-15)
+
+
+@pytest.mark.parametrize("term", [TERM, DRIVEN], ids=["damped", "driven"])
+def test_energy_error_is_that_of_the_solver(term):
+    saveat = dfx.SaveAt(ts=jnp.linspace(1.0, 11.0, 1001))
+
+    def error(solver):
+        hamiltonian = term.hamiltonian
+        sol = solve(hamiltonian, solver, 1.0, 11.0, 0.01, Y0, 0.7, saveat=saveat)
+        return diagnostics.energy_error(term, sol.ts, sol.ys, 0.7)
+
+    fine, coarse = error(dps.BlanesMoanRKN6()), error(dps.PresymplecticEuler())
+    assert np.max(np.abs(fine)) < 1e-8
+    assert 1e-4 < np.max(np.abs(coarse)) < 1e-1
+    assert fine[0] == 0 and fine.shape == (1001,)
+
+
+def test_energy_error_of_a_conserved_energy_is_its_change():
+    term = dps.HamiltonianTerm(
+        dps.SeparableHamiltonian(dps.QuadraticKinetic(), harmonic)
+    )
+    ts, ys = jnp.array([0.0, 1.0]), (jnp.array([[1.0], [2.0]]), jnp.zeros((2, 1)))
+    error = diagnostics.energy_error(term, ts, ys)
+    assert_close(error, jnp.array([0.0, 1.5]), 1e-15)
+
+
+def test_structure_defect():
+    def defect(solver):
+        return diagnostics.structure_defect(DRIVEN, solver, 1.0, 1.3, Y0, 0.7)
+
+    assert defect(dps.PresymplecticLeapfrog()) < 1e-14
+    assert defect(dps.BlanesCasasRKN8()) < 1e-13
+    assert 1e-9 < defect(dfx.Tsit5()) < 1e-3
+    assert 1e-3 < defect(dfx.Euler())
+
+
+@pytest.mark.parametrize(
+    "solver, order",
+    [(dps.PresymplecticEuler(), 1), (dps.BlanesMoan4(), 4), (dfx.Bosh3(), 3)],
+)
+def test_convergence_order(solver, order):
+    measured = diagnostics.convergence_order(DRIVEN, solver, 1.0, 3.0, Y0, 20, 0.7)
+    assert abs(measured - order) < 0.2
+    with pytest.raises(ValueError, match="steps"):
+        diagnostics.convergence_order(DRIVEN, solver, 1.0, 3.0, Y0, 0, 0.7)
+
+
+def test_only_copies_have_a_distance():
+    with pytest.raises(ValueError, match="keeps no copies"):
+        diagnostics.copy_distance(dps.PresymplecticLeapfrog(), Y0, None)

@@ -1,0 +1,304 @@
+"""Steps by the state: reversible, positive, and without drift of the energy."""
+
+import dataclasses
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close
+
+import diffrax_presym as dps
+
+
+E = 0.9
+Y0 = (jnp.array([1 - E, 0.0]), jnp.array([0.0, ((1 + E) / (1 - E)) ** 0.5]))
+PERIOD = 2 * np.pi
+
+
+def attraction(t, q, args):
+    return -1 / jnp.linalg.norm(q)
+
+
+def kepler(gamma=None):
+    kinetic = dps.QuadraticKinetic()
+    if gamma is None:
+        return dps.HamiltonianTerm(dps.SeparableHamiltonian(kinetic, attraction))
+    damping = dps.ConstantDamping(gamma)
+    return dps.HamiltonianTerm(dps.ConformalHamiltonian(kinetic, attraction, damping))
+
+
+KEPLER = kepler()
+DENSITIES = {
+    "distance": dps.DistanceDensity(),
+    "arclength": dps.ArclengthDensity(KEPLER),
+    "own": lambda t, y, args: jnp.sum(y[0] ** 2) + 0.1,
+}
+
+
+@eqx.filter_jit
+def solve(controller, solver, t0, t1, y0, **kwargs):
+    options = dict(dt0=None, max_steps=2000, throw=False) | kwargs
+    return dfx.diffeqsolve(
+        controller.term,
+        solver,
+        t0=jnp.asarray(t0),
+        t1=jnp.asarray(t1),
+        y0=y0,
+        stepsize_controller=controller,
+        **options,
+    )
+
+
+@pytest.mark.parametrize("density", DENSITIES)
+@pytest.mark.parametrize("solver", [dps.PresymplecticLeapfrog(), dps.BlanesMoanRKN6()])
+def test_a_solve_goes_back_the_way_it_came(density, solver):
+    controller = dps.StepDensityController(KEPLER, 0.05, DENSITIES[density])
+    steps = 300
+    saveat = dfx.SaveAt(t0=True, steps=True, controller_state=True)
+    there = solve(controller, solver, 0.0, 1e3, Y0, saveat=saveat, max_steps=steps)
+    end = jax.tree.map(lambda y: y[-1], there.ys)
+    state = controller.reverse(there.ts[-1], end, None, there.controller_state)
+    back = solve(
+        controller,
+        solver,
+        there.ts[-1],
+        0.0,
+        end,
+        saveat=saveat,
+        dt0=-controller.step_size(state),
+        controller_state=state,
+    )
+    # Rounding may leave a last step of no length.
+    assert int(back.stats["num_steps"]) in (steps, steps + 1)
+    ts = np.asarray(there.ts)
+    assert np.ptp(np.diff(ts)) > 1e-2
+    assert np.max(np.abs(ts - np.asarray(back.ts)[steps::-1])) < 1e-9
+    assert_close(there.ys, jax.tree.map(lambda y: y[steps::-1], back.ys), 1e-9)
+
+
+class Naive(dps.StepDensityController):
+    """What one would write first: the density where the step starts."""
+
+    def adapt_step_size(self, t0, t1, y0, y1, args, error, order, state):
+        h = self.epsilon * self.density(t1, y1, args)
+        return True, t1, t1 + h, False, state, dfx.RESULTS.successful
+
+
+def energy_means(controller, solver, orbits, **kwargs):
+    """Of the error in the energy, over the first and over the last tenth."""
+    saveat = dfx.SaveAt(steps=True)
+    kwargs = dict(saveat=saveat, max_steps=16384) | kwargs
+    sol = solve(controller, solver, 0.0, orbits * PERIOD, Y0, **kwargs)
+    taken = np.isfinite(sol.ts)
+    error = np.asarray(dps.diagnostics.energy(controller.term, sol.ts, sol.ys))[taken]
+    part = len(error) // 10
+    error = error + 0.5
+    return np.mean(error[:part]), np.mean(error[-part:]), np.max(np.abs(error))
+
+
+def test_the_energy_of_an_eccentric_orbit_does_not_drift():
+    leapfrog, density = dps.PresymplecticLeapfrog(), dps.DistanceDensity()
+    first, last, largest = energy_means(
+        dps.StepDensityController(KEPLER, 0.1, density), leapfrog, 150
+    )
+    assert abs(last - first) < 0.05 * largest and largest < 0.02
+    # It is the control that does this, and not the density.
+    first, last, _ = energy_means(Naive(KEPLER, 0.1, density), leapfrog, 150)
+    assert abs(last - first) > 0.05
+
+
+def test_damping_takes_the_energy_it_should():
+    # Against tiny constant steps of an unrelated solver.
+    term = kepler(1e-2)
+    controller = dps.StepDensityController(term, 0.1, dps.DistanceDensity())
+    sol = solve(controller, dps.BlanesMoanRKN6(), 0.0, 3 * PERIOD, Y0)
+    exact = dfx.diffeqsolve(
+        term,
+        dfx.Dopri8(),
+        0.0,
+        3 * PERIOD,
+        None,
+        Y0,
+        max_steps=10**5,
+        stepsize_controller=dfx.PIDController(rtol=1e-12, atol=1e-12),
+    )
+    assert_close(sol.ys, exact.ys, 1e-6)
+
+
+def test_steps_follow_the_density():
+    density = dps.DistanceDensity()
+    controller = dps.StepDensityController(KEPLER, 0.05, density)
+    saveat = dfx.SaveAt(t0=True, steps=True)
+    sol = solve(controller, dps.BlanesMoanRKN4(), 0.0, 1e3, Y0, saveat=saveat)
+    sigma = np.asarray(jax.vmap(lambda q: density(0.0, (q, q), None))(sol.ys[0]))
+    steps = np.diff(sol.ts)
+    ratio = steps / (0.05 * np.sqrt(sigma[1:] * sigma[:-1]))
+    assert steps.max() / steps.min() > 50
+    assert np.all(np.abs(np.log(ratio)) < 0.02)
+
+
+def test_the_same_in_any_solver_of_diffrax():
+    controller = dps.StepDensityController(KEPLER, 0.05, dps.DistanceDensity())
+    solvers = dps.BlanesCasasRKN8(), dfx.Dopri8()
+    ours, theirs = (solve(controller, s, 0.0, PERIOD, Y0).ys for s in solvers)
+    assert_close(ours, theirs, 1e-6)
+
+
+def test_backwards_in_time_is_the_same_motion():
+    def density(t, y, args):
+        return (2 + jnp.sin(t)) * jnp.sum(y[0] ** 2)
+
+    controller = dps.StepDensityController(KEPLER, 0.02, density)
+    end = solve(controller, dps.BlanesCasasRKN8(), 1.0, 3.0, Y0)
+    y1 = jax.tree.map(lambda y: y[-1], end.ys)
+    start = solve(controller, dps.BlanesCasasRKN8(), 3.0, 1.0, y1)
+    assert_close(jax.tree.map(lambda y: y[-1], start.ys), Y0, 1e-7)
+    # The same steps for the mirrored system.
+    mirrored = eqx.tree_at(
+        lambda c: c.density, controller, lambda t, y, args: density(-t, y, args)
+    )
+    turned = Y0[0], -Y0[1]
+    back = solve(mirrored, dps.BlanesCasasRKN8(), -1.0, -3.0, turned)
+    assert_close(back.ys[0], end.ys[0], 1e-11)
+    assert int(back.stats["num_steps"]) == int(end.stats["num_steps"])
+
+
+def test_gradients_through_the_steps():
+    def loss(epsilon, power, q0):
+        density = dps.DistanceDensity(power)
+        controller = dps.StepDensityController(KEPLER, epsilon, density)
+        y0 = (q0, Y0[1])
+        sol = solve(controller, dps.PresymplecticLeapfrog(), 0.0, 4.0, y0)
+        return jnp.sum(sol.ys[0] ** 2 + sol.ys[1])
+
+    at = jnp.array(0.1), jnp.array(1.4), Y0[0]
+    gradient = jax.grad(loss, argnums=(0, 1, 2))(*at)
+    for i, g in enumerate(gradient):
+        d = 1e-6 * jnp.ones_like(at[i])
+        up, down = (loss(*at[:i], at[i] + sign * d, *at[i + 1 :]) for sign in (1, -1))
+        assert_close(jnp.sum(g), (up - down) / 2e-6, 1e-5)
+
+
+def test_many_at_once():
+    def end(epsilon, e):
+        y0 = jnp.stack([1 - e, 0.0 * e]), jnp.stack([0 * e, ((1 + e) / (1 - e)) ** 0.5])
+        controller = dps.StepDensityController(KEPLER, epsilon, dps.DistanceDensity())
+        sol = solve(controller, dps.PresymplecticLeapfrog(), 0.0, PERIOD, y0)
+        return sol.ys, sol.stats["num_steps"]
+
+    epsilons, es = jnp.array([0.05, 0.1, 0.1]), jnp.array([0.5, 0.5, 0.8])
+    ys, steps = jax.vmap(end)(epsilons, es)
+    assert len(set(np.asarray(steps).tolist())) > 1
+    for i in range(3):
+        alone, n = end(epsilons[i], es[i])
+        assert_close((ys[0][i], ys[1][i]), alone, 1e-12)
+        assert int(n) == int(steps[i])
+
+
+def test_single_precision_stays_single():
+    single = lambda tree: jax.tree.map(lambda x: x.astype(jnp.float32), tree)
+    controller = dps.StepDensityController(KEPLER, 0.05, dps.DistanceDensity())
+    t1 = jnp.float32(PERIOD)
+    saveat = dfx.SaveAt(t1=True, controller_state=True)
+    args = controller, dps.PresymplecticLeapfrog(), jnp.float32(0), t1
+    sol = solve(*args, single(Y0), saveat=saveat)
+    assert sol.controller_state.dtype == sol.ys[0].dtype == jnp.float32
+    double = solve(controller, dps.PresymplecticLeapfrog(), 0.0, PERIOD, Y0)
+    assert_close(sol.ys, double.ys, 1e-3)
+
+
+def test_a_solve_can_be_continued():
+    controller = dps.StepDensityController(KEPLER, 0.05, dps.DistanceDensity())
+    solver = dps.PresymplecticLeapfrog()
+    saveat = dfx.SaveAt(steps=True)
+    whole = solve(controller, solver, 0.0, 1e3, Y0, saveat=saveat, max_steps=100)
+    both = dataclasses.replace(saveat, controller_state=True)
+    half = solve(controller, solver, 0.0, 1e3, Y0, saveat=both, max_steps=50)
+    rest = solve(
+        controller,
+        solver,
+        half.ts[-1],
+        1e3,
+        jax.tree.map(lambda y: y[-1], half.ys),
+        saveat=saveat,
+        max_steps=50,
+        dt0=controller.step_size(half.controller_state),
+        controller_state=half.controller_state,
+    )
+    assert_close(rest.ys, jax.tree.map(lambda y: y[50:], whole.ys), 1e-12)
+
+
+def test_distances_of_pairs():
+    q = jnp.array([[0.0, 0.0], [3.0, 4.0], [0.0, 1.0]])
+    assert_close(dps.pair_distances(q), jnp.array([5.0, 1.0, 18**0.5]), 1e-15)
+    density = dps.DistanceDensity(2.0, dps.pair_distances)
+    expected = (5.0**-4 + 1 + 18.0**-2) ** -0.5
+    assert_close(density(0.0, (q, q), None), jnp.array(expected), 1e-14)
+
+
+def test_a_step_that_vanishes_is_a_failure():
+    density = lambda t, y, args: jnp.maximum(2.0 - t, 0.0)
+    controller = dps.StepDensityController(KEPLER, 0.1, density)
+    sol = solve(controller, dps.PresymplecticLeapfrog(), 0.0, 3.0, Y0)
+    failed = dfx.RESULTS.dt_min_reached, dfx.RESULTS.max_steps_reached
+    assert sol.result in failed
+    zero = eqx.tree_at(lambda c: c.density, controller, lambda t, y, args: 0 * t)
+    sol = solve(zero, dps.PresymplecticLeapfrog(), 0.0, 3.0, Y0)
+    assert sol.result == dfx.RESULTS.dt_min_reached
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    {
+        "epsilon": (
+            lambda: dps.StepDensityController(KEPLER, -0.1, dps.DistanceDensity()),
+            "epsilon",
+        ),
+        "density": (lambda: dps.StepDensityController(KEPLER, 0.1, 1.0), "density"),
+        "term": (
+            lambda: dps.StepDensityController(
+                dfx.ODETerm(lambda t, y, args: y), 0.1, dps.DistanceDensity()
+            ),
+            "HamiltonianTerm",
+        ),
+        "arclength": (lambda: dps.ArclengthDensity(None), "HamiltonianTerm"),
+        "power": (lambda: dps.DistanceDensity(0.0), "power"),
+        "dt0": (
+            lambda: solve(
+                dps.StepDensityController(KEPLER, 0.1, dps.DistanceDensity()),
+                dps.PresymplecticLeapfrog(),
+                0.0,
+                1.0,
+                Y0,
+                dt0=0.1,
+            ),
+            "dt0=None",
+        ),
+        "shape": (
+            lambda: solve(
+                dps.StepDensityController(KEPLER, 0.1, lambda t, y, args: y[0]),
+                dps.PresymplecticLeapfrog(),
+                0.0,
+                1.0,
+                Y0,
+            ),
+            "one real number",
+        ),
+        "grid steps": (lambda: dps.power_grid(0.0, 1.0, 0, 2.0), "steps"),
+        "grid power": (lambda: dps.power_grid(0.0, 1.0, 5, -2.0), "power"),
+        "grid times": (lambda: dps.power_grid(-1.0, 1.0, 5, 2.0), "not negative"),
+    }.values(),
+)
+def test_bad_input_says_what_to_write(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_a_grid_of_powers():
+    ts = dps.power_grid(1.0, 9.0, 4, 2.0)
+    assert_close(ts, jnp.array([1.0, 2.25, 4.0, 6.25, 9.0]), 1e-15)
+    assert ts[-1] == 9.0 and ts[0] == 1.0
+    assert dps.power_grid(jnp.float32(0), jnp.float32(1), 3, 0.5).dtype == jnp.float32
