@@ -23,6 +23,8 @@ Kind = Literal[
     "split",  # a kinetic energy whose exact flow is known, and V(t, q)
     "quadratic",  # a quadratic kinetic energy, and V(t, q)
     "augmented",  # anything; the solver state holds a copy `(q, p)` in `carry[0]`
+    "coupled",  # anything; the solver state is half the difference of two copies
+    "projected",  # anything, and not symplectic
 ]
 
 
@@ -62,7 +64,19 @@ SCHEMES = [
         9,
         kind="augmented",
     ),
+    Scheme("coupled", dps.PresymplecticCoupled(), 2, 3, kind="coupled"),
+    Scheme("coupled_4", dps.PresymplecticCoupled(4), 4, 11, kind="coupled"),
+    Scheme(
+        "projected_4",
+        dps.PresymplecticProjected(4),
+        4,
+        11,
+        symmetric=False,
+        kind="projected",
+    ),
 ]
+# Those that are explicit for any energy.
+ANY: tuple[Kind, ...] = ("augmented", "coupled", "projected")
 
 # Schemes for any energy: those with frozen velocities, made implicit.
 _finder = optx.Newton(rtol=1e-12, atol=1e-12)
@@ -76,6 +90,7 @@ IMPLICIT = [
     Scheme("leapfrog_AB", dps.PresymplecticLeapfrog("momentum", _finder), 2, 1),
     Scheme("leapfrog_BA", dps.PresymplecticLeapfrog("position", _finder), 2, 1),
     Scheme("suzuki_yoshida_4_BA", dps.PresymplecticYoshida4("position", _finder), 4, 3),
+    Scheme("midpoint", dps.PresymplecticMidpoint(_finder), 2, 1),
 ]
 
 

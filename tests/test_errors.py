@@ -216,7 +216,7 @@ def test_nonseparable_energies_need_a_root_finder(scheme: Scheme, hamiltonian):
     assert f"This `{type(hamiltonian).__name__}` is not separable" in message
     # All three ways out.
     assert "`root_finder=optimistix.Newton(rtol=1e-10, atol=1e-10)`" in message
-    assert "`PresymplecticTao()`" in message
+    assert "`PresymplecticCoupled()`" in message
     assert all(parts in message for parts in PARTS)
 
 
@@ -232,7 +232,7 @@ def test_splittings_need_a_split_energy(solver, hamiltonian):
     with pytest.raises(ValueError) as error:
         trace(dps.HamiltonianTerm(hamiltonian), solver)
     given = f"this `{type(hamiltonian).__name__}` is not"
-    Mistake(given, SPLIT, "`PresymplecticTao()`").check(error)
+    Mistake(given, SPLIT, "`PresymplecticCoupled()`").check(error)
     assert all(parts in str(error.value) for parts in PARTS)
 
 
@@ -660,7 +660,7 @@ HAMILTONIANS = {
     ),
     "exact drift of an energy that is not split": (
         lambda: NONSEPARABLE["damped"].drift(jnp.array(0.0), jnp.array(0.1), *PAIR),
-        Mistake("`Hamiltonian(energy)`", "not split", "`PresymplecticTao()`"),
+        Mistake("`Hamiltonian(energy)`", "not split", "`PresymplecticCoupled()`"),
     ),
 }
 

@@ -9,6 +9,7 @@ import pytest
 import scipy.integrate
 import scipy.special
 from helpers import (
+    ANY,
     each,
     flat,
     harmonic,
@@ -231,11 +232,11 @@ def test_order_on_quadratic_kinetic_energies(scheme: Scheme, system):
     check_order(scheme, system)
 
 
-@each(kinds=("frozen", "augmented"))
+@each(kinds=("frozen", *ANY))
 def test_order_where_both_energies_depend_on_time(scheme: Scheme):
     check_order(scheme, "driven")
 
 
-@each([*IMPLICIT, *(scheme for scheme in SCHEMES if scheme.kind == "augmented")])
+@each([*IMPLICIT, *(scheme for scheme in SCHEMES if scheme.kind in ANY)])
 def test_order_on_nonseparable_energies(scheme: Scheme):
     check_order(scheme, "nonseparable")

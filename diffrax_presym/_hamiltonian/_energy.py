@@ -116,7 +116,7 @@ class Hamiltonian(AbstractHamiltonian):
     r"""Any energy $E(t, q, p)$, without damping; not taken to be separable.
 
     Euler and leapfrog are implicit for it and need a root finder;
-    [`diffrax_presym.PresymplecticTao`][] is explicit.
+    [`diffrax_presym.PresymplecticCoupled`][] is explicit.
     If the energy is a sum $T(t, p) + V(t, q)$, write
     [`diffrax_presym.SeparableHamiltonian`][] instead.
     """
@@ -185,5 +185,5 @@ class Hamiltonian(AbstractHamiltonian):
         raise ValueError(
             "`Hamiltonian(energy)` has no exact drift, because it is not split into a "
             "kinetic and a potential part. Write `SeparableHamiltonian(kinetic, "
-            "potential)` if it is, or use a solver such as `PresymplecticTao()`."
+            "potential)` if it is, or use a solver such as `PresymplecticCoupled()`."
         )

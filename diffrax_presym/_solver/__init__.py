@@ -9,8 +9,13 @@ from ._composition import (
     Suzuki4 as Suzuki4,
     SuzukiYoshida as SuzukiYoshida,
 )
+from ._copies import (
+    PresymplecticCoupled as PresymplecticCoupled,
+    PresymplecticProjected as PresymplecticProjected,
+)
 from ._euler import PresymplecticEuler as PresymplecticEuler
 from ._leapfrog import PresymplecticLeapfrog as PresymplecticLeapfrog
+from ._midpoint import PresymplecticMidpoint as PresymplecticMidpoint
 from ._splitting import (
     BlanesCasasRKN8 as BlanesCasasRKN8,
     BlanesMoan4 as BlanesMoan4,

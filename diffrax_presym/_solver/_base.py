@@ -185,10 +185,10 @@ class AbstractKickDriftSolver(AbstractPresymplecticSolver[_Carry]):
                 instead = "use `Strang()` or `BlanesMoan4()`, which are explicit."
             else:
                 instead = (
-                    "use `PresymplecticTao()`, which is explicit; or, if the energy is "
-                    "a sum T(t, p) + V(t, q), give its parts: `SeparableHamiltonian("
-                    "kinetic, potential)` or `ConformalHamiltonian(kinetic, potential, "
-                    "damping)`."
+                    "use `PresymplecticCoupled()`, which is explicit; or, if the energy "
+                    "is a sum T(t, p) + V(t, q), give its parts: "
+                    "`SeparableHamiltonian(kinetic, potential)` or "
+                    "`ConformalHamiltonian(kinetic, potential, damping)`."
                 )
             raise ValueError(
                 f"This `{type(view.hamiltonian).__name__}` is not separable, so "

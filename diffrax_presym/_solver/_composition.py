@@ -12,6 +12,7 @@ from jaxtyping import PyTree
 
 from .._term import State, View
 from ._base import AbstractPresymplecticSolver, Clock, stage_table
+from ._copies import PresymplecticCoupled
 from ._leapfrog import PresymplecticLeapfrog
 from ._tableaus import (
     CompositionTableau,
@@ -57,12 +58,17 @@ class AbstractComposition(AbstractPresymplecticSolver[PyTree]):
             )
         while isinstance(base, AbstractComposition):
             base = base.base
+        if isinstance(base, PresymplecticCoupled):
+            raise ValueError(
+                "`PresymplecticCoupled` composes by itself, and turns its copies only "
+                "after. Write `PresymplecticCoupled(order)`."
+            )
         if isinstance(base, PresymplecticTao) and base.coupling is None:
             raise ValueError(
                 "Inside a composition `PresymplecticTao` needs a coupling that does "
                 "not change with the step, or the order is lost. Write "
                 "`PresymplecticTao(coupling)` with a few times the highest frequency "
-                "of the system."
+                "of the system, or `PresymplecticCoupled(order)`, which needs none."
             )
 
     @property

@@ -81,7 +81,7 @@ class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
                 f"potential, but this `{type(view.hamiltonian).__name__}` is not. "
                 "If it is a sum of the two, give its parts: `SeparableHamiltonian("
                 "kinetic, potential)` or `ConformalHamiltonian(kinetic, potential, "
-                "damping)`. For any other use `PresymplecticTao()`."
+                "damping)`. For any other use `PresymplecticCoupled()`."
             )
         if self.tableau.quadratic and not view.hamiltonian.is_quadratic:
             raise ValueError(
