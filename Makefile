@@ -11,13 +11,15 @@ PIP := -m pip --quiet --disable-pip-version-check install
 WORKERS ?= 2
 
 EXAMPLES := $(sort $(filter-out examples/_%,$(wildcard examples/*.py)))
+# The experiments of the paper share code, so they are run as modules.
+PAPER := $(notdir $(basename $(filter-out examples/paper/_%,$(wildcard examples/paper/*.py))))
 BENCHMARKS := against_loop compile_time schemes work_precision batches
 
 # No window is ever opened: figures go to files.
 export MPLBACKEND ?= Agg
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test oldest lint format docs serve examples bench clean
+.PHONY: help demo test oldest lint format docs serve examples paper bench clean
 # The targets share one environment, so never two at a time.
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
@@ -57,6 +59,14 @@ serve: $(VENV)/.with-docs  ## Serve the documentation while you edit it
 examples: $(VENV)/.with-examples  ## Run every example, quickly
 	@set -e; for script in $(EXAMPLES); do \
 		echo "--- $$script --quick"; $(BIN)/python $$script --quick; \
+	done; \
+	for name in $(PAPER); do \
+		echo "--- $$name --quick"; $(BIN)/python -m examples.paper.$$name --quick; \
+	done
+
+paper: $(VENV)/.with-examples  ## Reproduce the paper: its figures, and a table of its claims
+	@set -e; for name in $(PAPER); do \
+		echo "--- $$name"; $(BIN)/python -m examples.paper.$$name --docs; \
 	done
 
 bench: $(VENV)/.with-benchmarks  ## Run every benchmark
