@@ -30,7 +30,7 @@ def energy(term: HamiltonianTerm, ts: Times, ys: State, args: PyTree = None) -> 
     An array with an entry for each time. Where nothing was saved (`ts` is infinite
     beyond the last step of `SaveAt(steps=True)`) it is not finite either.
     """
-    return _at_each(lambda t, y: term.hamiltonian.energy(t, *y, args), ts, ys)
+    return _at_each(lambda t, y: term.hamiltonian.energy(t, *y, args=args), ts, ys)
 
 
 def canonical_energy(
@@ -45,7 +45,7 @@ def canonical_energy(
     As [`diffrax_presym.diagnostics.energy`][].
     """
 
-    return _at_each(lambda t, y: term.hamiltonian.canonical(t, *y, args), ts, ys)
+    return _at_each(lambda t, y: term.hamiltonian.canonical(t, *y, args=args), ts, ys)
 
 
 def energy_error(

@@ -40,6 +40,7 @@ def test_energy_error_is_that_of_the_solver(term):
     def error(solver):
         hamiltonian = term.hamiltonian
         sol = solve(hamiltonian, solver, 1.0, 11.0, 0.01, Y0, 0.7, saveat=saveat)
+        assert sol.ts is not None and sol.ys is not None
         return diagnostics.energy_error(term, sol.ts, sol.ys, 0.7)
 
     fine, coarse = error(dps.BlanesMoanRKN6()), error(dps.PresymplecticEuler())

@@ -25,11 +25,19 @@ PUBLIC = {
     for name, value in vars(dps).items()
     if not name.startswith("_") and not inspect.ismodule(value)
 }
+PUBLIC |= {
+    f"diagnostics.{name}": value
+    for name, value in vars(dps.diagnostics).items()
+    if not name.startswith("_")
+    and getattr(value, "__module__", "").endswith(".diagnostics")
+}
 FENCE = re.compile(
     r"^(?P<indent> *)```(?P<language>[^\n`]*)\n(?P<code>.*?)^(?P=indent)```$",
     re.DOTALL | re.MULTILINE,
 )
-REFERENCE = re.compile(r"\[`?(diffrax_presym\.\w+)`?\]\[|\]\[(diffrax_presym\.\w+)\]")
+REFERENCE = re.compile(
+    r"\[`?(diffrax_presym\.[\w.]+)`?\]\[|\]\[(diffrax_presym\.[\w.]+)\]"
+)
 
 
 def python_blocks(text):
@@ -104,6 +112,9 @@ def test_docstring_is_complete(name):
     doc = inspect.getdoc(value)
     assert doc and doc.splitlines()[0]
     assert value.__doc__, "inherited, not its own"
+    if not inspect.isclass(value):
+        assert "**Arguments:**" in doc
+        return
     if issubclass(value, dps.AbstractPresymplecticSolver) and value is not (
         dps.AbstractPresymplecticSolver
     ):

@@ -185,8 +185,8 @@ class AbstractKickDriftSolver(AbstractPresymplecticSolver[_Carry]):
                 instead = "use `Strang()` or `BlanesMoan4()`, which are explicit."
             else:
                 instead = (
-                    "use `PresymplecticCoupled()`, which is explicit; or, if the energy "
-                    "is a sum T(t, p) + V(t, q), give its parts: "
+                    "use `PresymplecticCoupled()`, which is explicit; or, if the "
+                    "energy is a sum T(t, p) + V(t, q), give its parts: "
                     "`SeparableHamiltonian(kinetic, potential)` or "
                     "`ConformalHamiltonian(kinetic, potential, damping)`."
                 )
