@@ -131,7 +131,7 @@ class StepDensityController(dfx.AbstractStepSizeController):
     term: HamiltonianTerm
     epsilon: Scalar
     density: Callable
-    direction: ArrayLike = 1
+    direction: ArrayLike
 
     def __init__(self, term: HamiltonianTerm, epsilon: ArrayLike, density: Callable):
         r"""**Arguments:**
@@ -159,6 +159,7 @@ class StepDensityController(dfx.AbstractStepSizeController):
                 "`DistanceDensity()`."
             )
         self.density = density
+        self.direction = 1
 
     def wrap(self, direction):
         return eqx.tree_at(lambda self: self.direction, self, direction)
