@@ -75,6 +75,23 @@ SCHEMES = [
         kind="projected",
     ),
 ]
+# One for each way through the code, from which the others differ by numbers alone.
+WAYS = [
+    scheme
+    for scheme in SCHEMES
+    if scheme.name
+    in {
+        "euler_B",
+        "leapfrog_AB",
+        "leapfrog_BA",
+        "suzuki_yoshida_4",
+        "substeps",
+        "strang",
+        "tao_4",
+        "coupled_4",
+        "projected_4",
+    }
+]
 # Those that are explicit for any energy.
 ANY: tuple[Kind, ...] = ("augmented", "coupled", "projected")
 
@@ -103,6 +120,13 @@ def each(schemes=SCHEMES, *, kinds: tuple[Kind, ...] | None = None, symmetric=No
         and (symmetric is None or scheme.symmetric == symmetric)
     ]
     return pytest.mark.parametrize("scheme", chosen, ids=repr)
+
+
+def few(cases, schemes):
+    """All cases for each way through the code, and for the other schemes the first."""
+    first, *_ = cases
+    chosen = [(s, c) for s in schemes for c in cases if s in WAYS or c == first]
+    return pytest.mark.parametrize("scheme, case", chosen, ids=repr)
 
 
 def reference(name: str):

@@ -20,6 +20,7 @@ from helpers import (
     Scheme,
     SCHEMES,
     step,
+    WAYS,
 )
 from jaxtyping import Array
 
@@ -110,7 +111,7 @@ def position(t, y, args):
     return t + y[0][0]
 
 
-@each()
+@each(WAYS)
 def test_saving_steps_ends_and_times(scheme: Scheme):
     saveat = dfx.SaveAt(
         subs={
@@ -150,7 +151,7 @@ def test_saving_steps_ends_and_times(scheme: Scheme):
     assert_close(at_steps, at(0, 2, 6), 1e-14)
 
 
-@each()
+@each(WAYS)
 def test_steps_by_a_constant_and_to_given_times_agree(scheme: Scheme, exact):
     y, _ = go(scheme, 1.0, 2.0, Y0)
     ts = jnp.linspace(1.0, 2.0, 33)
@@ -180,7 +181,7 @@ def test_a_step_that_does_not_divide_the_span(scheme: Scheme, exact):
 # Going on
 
 
-@each()
+@each(WAYS)
 def test_going_on_with_the_solver_state_is_one_solve_bit_for_bit(scheme: Scheme):
     y, state = go(scheme, 1.0, 3.0, Y0)
     halfway, carried = go(scheme, 1.0, 2.0, Y0)
@@ -218,7 +219,7 @@ def test_there_and_back(scheme: Scheme):
     assert_close(y_back, Y0, 1e-12)
 
 
-@each()
+@each(WAYS)
 def test_backwards_the_past_is_found(scheme: Scheme, exact):
     # Logarithmic damping has no past before the time 0: the physical time is what
     # counts, not the one that Diffrax counts upwards.
@@ -281,7 +282,7 @@ def test_jumps_of_the_force(scheme: Scheme):
     assert_close(jtu.tree_map(lambda y: y[-1], ys), expected, 1e-12)
 
 
-@each()
+@each(WAYS)
 def test_half_steps_estimate_the_error(scheme: Scheme, exact):
     tolerance = 1e-3 if scheme.order == 1 else 1e-5
 
@@ -319,7 +320,7 @@ def array_energy(t, q, args):
     return args * jnp.sum(1 - jnp.cos(q))
 
 
-@each()
+@each(WAYS)
 def test_states_are_any_pytrees(scheme: Scheme):
     q, p = jnp.arange(1.0, 6.0) / 4, jnp.arange(5.0) / 5
     damping = dps.ConstantDamping(0.3)
@@ -361,7 +362,7 @@ def test_numbers_are_states_too(scheme: Scheme, q0, p0):
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-@each()
+@each(WAYS)
 def test_precision_is_that_of_the_input(scheme: Scheme, dtype):
     saveat = dfx.SaveAt(
         t0=True, steps=True, ts=jnp.array([1.2], dtype), dense=True, solver_state=True
@@ -387,7 +388,7 @@ def test_precision_is_that_of_the_input(scheme: Scheme, dtype):
 # Ends
 
 
-@each()
+@each(WAYS)
 def test_an_empty_span_is_its_start(scheme: Scheme):
     saveat = dfx.SaveAt(
         t0=True, t1=True, ts=jnp.array([1.0, 1.0]), dense=True, solver_state=True
@@ -463,7 +464,7 @@ def test_semi_implicit_euler_is_presymplectic_euler_without_damping():
 # Schemes inside of schemes
 
 
-@each()
+@each(WAYS)
 def test_substeps_are_steps(scheme: Scheme):
     times = jnp.array([1.0, 1.125, 1.25, 1.375, 1.5, 1.625, 1.75])
     whole = march(TERM, dps.Substeps(scheme.solver, 3), times[::3], Y0)
@@ -533,7 +534,7 @@ def test_progress_meters(scheme: Scheme, meter, capfd):
     assert "100.00%" in out + err
 
 
-@each()
+@each(WAYS)
 def test_a_second_call_is_not_traced_again(scheme: Scheme):
     traced = []
 
@@ -559,7 +560,7 @@ def test_a_second_call_is_not_traced_again(scheme: Scheme):
     assert len(traced) == times
 
 
-@each()
+@each(WAYS)
 def test_a_step_is_the_same_in_a_solve_and_alone(scheme: Scheme):
     t1 = 1.0 + STEP
     y, *_ = step(SYSTEM, scheme.solver, 1.0, t1, Y0, ARGS)

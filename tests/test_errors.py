@@ -15,7 +15,7 @@ import lineax as lx
 import numpy as np
 import optimistix as optx
 import pytest
-from helpers import assert_close, each, harmonic, mixed_energy, oscillator, Scheme
+from helpers import assert_close, each, harmonic, mixed_energy, oscillator, Scheme, WAYS
 
 import diffrax_presym as dps
 
@@ -109,7 +109,7 @@ def test_states(y0, mistake, solver):
     mistake.check(error)
 
 
-@each()
+@each(WAYS)
 def test_states_for_every_scheme(scheme: Scheme):
     with pytest.raises(ValueError, match=re.escape(STATE)):
         trace(TERM, scheme.solver, x)
@@ -123,7 +123,7 @@ def test_complex_states():
     Mistake("complex128[2]", REAL, "its real and imaginary parts").check(error)
 
 
-@each()
+@each(WAYS)
 def test_integer_states_are_for_diffeqsolve_to_convert(scheme: Scheme):
     y0 = (jnp.ones(2, int), jnp.ones(2, int))
     t0, t1 = jnp.array(0.0), jnp.array(0.1)
@@ -139,7 +139,7 @@ STEPPED = "Presymplectic solvers step a `HamiltonianTerm`"
 HAND_WRITTEN = "`HamiltonianTerm(VectorField(velocity, force))` for a hand-written"
 
 
-@each()
+@each(WAYS)
 def test_terms_of_another_kind(scheme: Scheme):
     with pytest.raises(ValueError) as error:
         trace(ODE, scheme.solver)

@@ -7,7 +7,17 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 import pytest
-from helpers import ANY, each, harmonic, IMPLICIT, mixed_energy, Scheme, SCHEMES, solve
+from helpers import (
+    ANY,
+    each,
+    harmonic,
+    IMPLICIT,
+    mixed_energy,
+    Scheme,
+    SCHEMES,
+    solve,
+    WAYS,
+)
 
 import diffrax_presym as dps
 
@@ -46,7 +56,7 @@ def check_late_times(scheme, hamiltonian, t1):
         assert np.all(np.abs(leaf) < 1e-4)
 
 
-@each()
+@each(WAYS)
 def test_no_overflow_at_a_log_scale_of_ten_thousand(scheme: Scheme):
     check_late_times(scheme, LATE["constant"], 1e4)
 
@@ -135,7 +145,7 @@ def check_dtypes(hamiltonian, solver, y, **kwargs):
 
 
 @pytest.mark.parametrize("system", SYSTEMS)
-@each()
+@each(WAYS)
 def test_float32_in_float32_inside_the_step(scheme: Scheme, system):
     if scheme.kind not in NEEDS.get(system, (scheme.kind,)):
         return
@@ -151,7 +161,7 @@ def test_float32_in_float32_inside_an_implicit_step(scheme: Scheme):
 
 
 @pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16, jnp.float64])
-@each()
+@each(WAYS)
 def test_states_of_other_precision_than_time(scheme: Scheme, dtype):
     leaf = jax.ShapeDtypeStruct((2,), dtype)
     check_dtypes(SYSTEMS["constant"], scheme.solver, (leaf, leaf))
@@ -174,7 +184,7 @@ MIXED_SYSTEMS = {
 
 
 @pytest.mark.parametrize("system", MIXED_SYSTEMS)
-@each()
+@each(WAYS)
 def test_leaves_of_different_precision(scheme: Scheme, system):
     check_dtypes(MIXED_SYSTEMS[system], scheme.solver, (MIXED, MIXED))
 

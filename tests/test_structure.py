@@ -14,6 +14,7 @@ import pytest
 from helpers import (
     assert_close,
     each,
+    few,
     flat,
     henon_heiles,
     IMPLICIT,
@@ -50,14 +51,14 @@ def swinging_energy(t, q, p, args):
 
 # damping law, and its eta(t) once more in NumPy
 DAMPINGS = {
-    "none": (None, lambda t: 0 * t),
-    "constant": (dps.ConstantDamping(0.7), lambda t: 0.7 * t),
-    "exciting": (dps.ConstantDamping(-0.7), lambda t: -0.7 * t),
-    "logarithmic": (dps.LogDamping(3.0), lambda t: 3 * np.log(t)),
     "mixed": (
         dps.MixedDamping(2.0, 0.5, 0.3),
         lambda t: 2 * np.log(t) + 0.5 * t**0.3,
     ),
+    "none": (None, lambda t: 0 * t),
+    "constant": (dps.ConstantDamping(0.7), lambda t: 0.7 * t),
+    "exciting": (dps.ConstantDamping(-0.7), lambda t: -0.7 * t),
+    "logarithmic": (dps.LogDamping(3.0), lambda t: 3 * np.log(t)),
     # Its rate changes sign inside the step taken below.
     "callable": (lambda t: 3 * (t - 2.05) ** 2, lambda t: 3 * (t - 2.05) ** 2),
 }
@@ -130,10 +131,9 @@ def contraction(eta):
     return float(np.exp(eta(T0) - eta(T1)))
 
 
-@pytest.mark.parametrize("damping", DAMPINGS)
-@each(CONFORMAL)
-def test_form_contracts_with_the_damping(scheme: Scheme, damping):
-    law, eta = DAMPINGS[damping]
+@few(DAMPINGS, CONFORMAL)
+def test_form_contracts_with_the_damping(scheme: Scheme, case):
+    law, eta = DAMPINGS[case]
     assert structure_defect(quadratic(law), scheme, contraction(eta)) < 1e-13
 
 
@@ -275,10 +275,9 @@ def check_canonical(scheme: Scheme, hamiltonian, H, tolerance):
     assert_close(solution, [q, p], tolerance)
 
 
-@pytest.mark.parametrize("pair", PAIRS)
-@each([scheme for scheme in SCHEMES if scheme.name in paper.SCHEMES])
-def test_solution_is_the_paper_s_in_canonical_momentum(scheme: Scheme, pair):
-    hamiltonian, H = PAIRS[pair]
+@few(PAIRS, [scheme for scheme in SCHEMES if scheme.name in paper.SCHEMES])
+def test_solution_is_the_paper_s_in_canonical_momentum(scheme: Scheme, case):
+    hamiltonian, H = PAIRS[case]
     check_canonical(scheme, hamiltonian, H, 1e-12)
 
 

@@ -5,7 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
-from helpers import assert_close, each, pendulum, Scheme, SCHEMES
+from helpers import assert_close, each, pendulum, Scheme, WAYS
 
 import diffrax_presym as dps
 
@@ -51,7 +51,7 @@ def element(batch, i):
     return jax.tree.map(lambda x: x[i], batch)
 
 
-@each([*SCHEMES, SPLITTING])
+@each([*WAYS, SPLITTING])
 def test_everything_at_once(scheme: Scheme):
     scales = jnp.array([0.8, 1.0, 1.25])
     batch = {name: jnp.tensordot(scales, x, 0) for name, x in ARGUMENTS.items()}
