@@ -13,7 +13,7 @@ WORKERS ?= 2
 EXAMPLES := $(sort $(filter-out examples/_%,$(wildcard examples/*.py)))
 # The experiments of the paper share code, so they are run as modules.
 PAPER := $(notdir $(basename $(filter-out examples/paper/_%,$(wildcard examples/paper/*.py))))
-BENCHMARKS := against_loop compile_time schemes work_precision batches
+BENCHMARKS := against_loop compile_time schemes work_precision batches nonseparable
 
 # No window is ever opened: figures go to files.
 export MPLBACKEND ?= Agg

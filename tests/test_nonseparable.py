@@ -64,6 +64,23 @@ def test_copies_that_resonate_part():
     assert 0 < 5 * distances[0] < distances[1]
 
 
+STRETCH = 40.0
+
+
+def stretched_energy(t, q, p, args):
+    return mixed_energy(t, q / STRETCH, p * STRETCH, args)
+
+
+def test_scale_undoes_units():
+    y0 = (STRETCH * START[0], START[1] / STRETCH)
+    solver = dps.PresymplecticCoupled(4, scale=STRETCH**2)
+    stretched = dps.Hamiltonian(stretched_energy)
+    sol: Any = solve(stretched, solver, 0.0, 10.0, 1 / 8, y0)
+    q, p = sol.ys
+    plain = solve(MIXED, dps.PresymplecticCoupled(4), 0.0, 10.0, 1 / 8, START).ys
+    assert_close((q / STRETCH, p * STRETCH), plain, 1e-10)
+
+
 def test_distance_of_the_copies_is_known():
     solver = dps.PresymplecticTao()
     saveat = dfx.SaveAt(t1=True, solver_state=True)
@@ -84,7 +101,7 @@ def canonical_energy(t, q, P, args):
 
 @pytest.mark.parametrize(
     "solver, dt0",
-    [(dps.PresymplecticTao(), 1 / 16), (dps.PresymplecticCoupled(4), 1 / 8)],
+    [(dps.PresymplecticTao(), 1 / 16), (dps.PresymplecticCoupled(4, scale=1.5), 1 / 8)],
 )
 def test_damped_motion_stays_finite_and_conformal(solver, dt0):
     sol = solve(DAMPED, solver, 0.0, 1000.0, dt0, START, max_steps=None)
@@ -185,6 +202,7 @@ NOTHING: Any = None
         (lambda: dps.PresymplecticCoupled(3), "2, 4, 6, 8 or 10"),
         (lambda: dps.PresymplecticProjected(5), "2, 4, 6, 8 or 10"),
         (lambda: dps.PresymplecticCoupled(angle=NOTHING), "real number"),
+        (lambda: dps.PresymplecticCoupled(scale=-1.0), "positive"),
         (lambda: dps.Suzuki4(dps.PresymplecticCoupled()), "composes by itself"),
         (lambda: dps.Suzuki4(dps.PresymplecticProjected()), "symmetric"),
         (lambda: dps.PresymplecticMidpoint(NOTHING), "root finder"),

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Inexact
 
-from .._misc import as_parameter, cast_to, tree_add, tree_scale, tree_sub
+from .._misc import as_parameter, as_positive, cast_to, tree_add, tree_scale, tree_sub
 from .._term import State, View
 from ._base import AbstractPresymplecticSolver, Clock, stage_table
 from ._tableaus import (
@@ -101,20 +101,26 @@ class PresymplecticCoupled(_AbstractCopies):
 
     composed_order: int = eqx.field(static=True)
     angle: Inexact[Array, ""]
+    scale: Inexact[Array, ""]
 
-    def __init__(self, order: int = 2, angle=math.pi / 2):
+    def __init__(self, order: int = 2, angle=math.pi / 2, scale=1.0):
         r"""**Arguments:**
 
         - `order`: the order, 2, 4, 6, 8 or 10. Defaults to 2.
         - `angle`: the angle by which the difference of the copies is turned per step,
             in radians. Multiples of $\pi$ let it accumulate. Defaults to $\pi/2$.
+        - `scale`: the ratio of the sizes of `q` and `p`, as in turning round an orbit
+            one becomes the other. With one that is far off only short steps are stable.
+            Defaults to 1.
 
         **Raises:**
 
-        `ValueError` if the order is none of these, or the angle is not a real number.
+        `ValueError` if the order is none of these, or the angle is not a real number or
+        the scale not a positive one.
         """
         self.composed_order = order
         self.angle = as_parameter(angle, "`PresymplecticCoupled(angle=...)`")
+        self.scale = as_positive(scale, "`PresymplecticCoupled(scale=...)`")
 
     @property
     def is_symmetric(self) -> bool:
@@ -126,11 +132,12 @@ class PresymplecticCoupled(_AbstractCopies):
     def advance(self, view: View, t0, t1, h, y: State, carry: State):
         # Half before and half after, in the direction of time: a symmetric step.
         angle = jnp.copysign(cast_to(self.angle, h) / 2, h)
-        half = turn(angle, carry)
+        scale = cast_to(self.scale, h)
+        half = turn(angle, carry, scale)
         y, copy = tree_add(y, 1, half), tree_sub(y, half)
         y, copy = self.compose(view, t0, t1, h, y, copy)
         half = tree_scale(0.5, tree_sub(y, copy))
-        return _mean(y, copy), turn(angle, half), None
+        return _mean(y, copy), turn(angle, half, scale), None
 
     def slope(self, view: View, t, y: State, carry: State) -> State:
         return view.slope(t, y)

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Inexact
+from jaxtyping import Array, ArrayLike, Inexact
 
 from .._misc import as_positive, cast_to, tree_add, tree_scale, tree_sub
 from .._term import State, View
@@ -145,15 +145,16 @@ def _rotate(angle, y: State, copy: State) -> tuple[State, State]:
     return tree_add(mean, 1, half), tree_sub(mean, half)
 
 
-def turn(angle, y: State) -> State:
-    """`q` and `p` turned into each other.
+def turn(angle, y: State, scale: ArrayLike = 1.0) -> State:
+    """`q` and `p` turned into each other, with `q` in units of `scale`.
 
     Both change at once. One after the other they would still look right in the energy,
     and not be symplectic.
     """
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     q, p = y
-    return tree_add(tree_scale(cos, q), sin, p), tree_add(tree_scale(cos, p), -sin, q)
+    q1 = tree_add(tree_scale(cos, q), sin * scale, p)
+    return q1, tree_add(tree_scale(cos, p), -sin / scale, q)
 
 
 def largest(x: State) -> Array:

@@ -1,0 +1,219 @@
+"""Three systems whose energy is no sum of kinetic and potential energy, with friction.
+
+- A charged particle with drag, in a trap and a magnetic field that dies away as fast as
+  the drag slows the particle: that much of drag on a charge is Hamiltonian. Checked
+  against Newton's second law.
+- A double pendulum with friction.
+- A relativistic particle around a black hole, in its Schwarzschild metric, losing
+  momentum slowly.
+
+Prints a table of errors against evaluations, and saves one picture. `--quick` runs a
+smaller version of all of it.
+"""
+
+import argparse
+import pathlib
+from typing import Any
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+import optimistix as optx
+
+import diffrax_presym as dps
+
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+from matplotlib.patches import Circle
+
+
+jax.config.update("jax_enable_x64", True)
+
+FIELD, DRAG = 4.0, 0.05
+
+
+def vector_potential(t, q):
+    """Of a uniform field across the plane."""
+    return jnp.exp(-DRAG * t) * FIELD / 2 * jnp.array([-q[1], q[0]])
+
+
+def trap(q):
+    return q[0] ** 2 / 2 + q[1] ** 2
+
+
+def charged(t, q, p, args):
+    return jnp.sum((p - vector_potential(t, q)) ** 2) / 2 + trap(q)
+
+
+def newton(t, y, args):
+    """Drag, the force of the field on a moving charge, and that of the trap."""
+    q, v = y
+    magnetic = jnp.exp(-DRAG * t) * FIELD * jnp.array([v[1], -v[0]])
+    return v, magnetic - DRAG * v - jax.grad(trap)(q)
+
+
+def double_pendulum(t, q, p, args):
+    """Of unit lengths, masses and gravity."""
+    a, b = q
+    cos = jnp.cos(a - b)
+    kinetic = p[0] ** 2 + 2 * p[1] ** 2 - 2 * p[0] * p[1] * cos
+    return kinetic / (2 * (2 - cos**2)) - 2 * jnp.cos(a) - jnp.cos(b)
+
+
+def black_hole(t, q, p, args):
+    """Equation of motion of a unit mass, in units of the mass of the hole."""
+    r = jnp.sqrt(q @ q)
+    lapse = 1 - 2 / r
+    radial = q @ p / r
+    return jnp.sqrt(lapse * (1 + p @ p - 2 / r * radial**2))
+
+
+def system(energy, gamma):
+    return dps.ConformalHamiltonian(energy=energy, damping=dps.ConstantDamping(gamma))
+
+
+# Hamiltonian, initial state, time, the longest of the steps of order 4, and the ratio
+# of the sizes of q and p
+SYSTEMS = {
+    "charged particle": (
+        system(charged, DRAG),
+        (jnp.array([1.0, 0.0]), jnp.array([0.0, 2.5])),
+        (40.0, 0.2, 1.0),
+    ),
+    "double pendulum": (
+        system(double_pendulum, 0.05),
+        (jnp.array([2.0, 1.0]), jnp.array([0.0, 0.0])),
+        (20.0, 0.1, 1.0),
+    ),
+    "black hole": (
+        system(black_hole, 2e-5),
+        (jnp.array([16.0, 0.0]), jnp.array([0.0, 0.27])),
+        (3000.0, 8.0, 50.0),
+    ),
+}
+FINDER = optx.Newton(rtol=1e-12, atol=1e-12)
+# And the evaluations of velocity and force in a step, of which an implicit one has none
+# that can be counted beforehand.
+SCHEMES = {
+    "Coupled, 4": (lambda scale: dps.PresymplecticCoupled(4, scale=scale), 11),
+    "Projected, 4": (lambda _: dps.PresymplecticProjected(4), 11),
+    "Coupled, 2": (lambda scale: dps.PresymplecticCoupled(2, scale=scale), 3),
+    "Tao": (lambda _: dps.PresymplecticTao(), 3),
+    "Midpoint, implicit": (lambda _: dps.PresymplecticMidpoint(FINDER), None),
+}
+
+
+def solve(hamiltonian, solver, y0, t1, steps, saveat, max_steps=None) -> Any:
+    return dfx.diffeqsolve(
+        dps.HamiltonianTerm(hamiltonian),
+        solver,
+        t0=0.0,
+        t1=t1,
+        dt0=t1 / steps,
+        y0=y0,
+        saveat=saveat,
+        max_steps=max_steps,
+        throw=False,
+    )
+
+
+def table(quick):
+    print("Error at the final time, and the evaluations it took\n")
+    print(f"{'':20}" + "".join(f"{name:>26}" for name in SYSTEMS))
+    exact = {}
+    for name, (H, y0, (t1, h, _)) in SYSTEMS.items():
+        controller = dfx.PIDController(rtol=1e-12, atol=1e-12)
+        sol: Any = dfx.diffeqsolve(
+            dps.HamiltonianTerm(H),
+            dfx.Dopri8(),
+            t0=0.0,
+            t1=t1,
+            dt0=h / 100,
+            y0=y0,
+            stepsize_controller=controller,
+            max_steps=None,
+        )
+        exact[name] = np.concatenate([np.asarray(y[-1]) for y in sol.ys])
+    for scheme, (make, cost) in SCHEMES.items():
+        if quick and scheme in ("Coupled, 2", "Midpoint, implicit"):
+            continue
+        row = f"{scheme:20}"
+        for name, (H, y0, (t1, h, scale)) in SYSTEMS.items():
+            # Steps of equal cost; those of the implicit scheme are as long as Tao's.
+            steps = round(t1 / h * (1 if quick else 4) * 11 / (cost or 3))
+            sol = solve(H, make(scale), y0, t1, steps, dfx.SaveAt(t1=True))
+            end = np.concatenate([np.asarray(y[-1]) for y in sol.ys])
+            error = np.max(np.abs(end - exact[name]))
+            count = f"{steps * cost}" if cost else f"{steps} root finds"
+            row += f"{error:>10.1e}{count:>16}"
+        print(row, flush=True)
+
+
+def against_newton():
+    """The largest difference of the positions to those by Newton's second law."""
+    H, (q0, p0), (t1, _, _) = SYSTEMS["charged particle"]
+    v0 = p0 - vector_potential(0.0, q0)
+    ts = jnp.linspace(0.0, t1, 201)
+    law: Any = dfx.diffeqsolve(
+        dfx.ODETerm(newton),
+        dfx.Dopri8(),
+        t0=0.0,
+        t1=t1,
+        dt0=0.01,
+        y0=(q0, v0),
+        saveat=dfx.SaveAt(ts=ts),
+        stepsize_controller=dfx.PIDController(rtol=1e-11, atol=1e-11),
+    )
+    solver, saveat = dps.PresymplecticCoupled(6), dfx.SaveAt(ts=ts)
+    mine = solve(H, solver, (q0, p0), t1, 2000, saveat)
+    difference = np.max(np.abs(np.asarray(law.ys[0] - mine.ys[0])))
+    print(f"\nCharged particle against Newton's second law: {difference:.1e}")
+
+
+def picture(path):
+    fig, axes = plt.subplots(1, 3, figsize=(14, 4.6), layout="constrained")
+    for ax, (name, (H, y0, (t1, h, scale))) in zip(axes, SYSTEMS.items(), strict=True):
+        steps = round(t1 / h * 10)
+        saveat = dfx.SaveAt(t0=True, steps=True)
+        solver = dps.PresymplecticCoupled(4, scale=scale)
+        sol = solve(H, solver, y0, t1, steps, saveat, steps + 2)
+        kept = np.isfinite(np.asarray(sol.ts))
+        q = np.asarray(sol.ys[0])[kept]
+        if name == "double pendulum":
+            a, b = q.T
+            q = np.stack([np.sin(a) + np.sin(b), -np.cos(a) - np.cos(b)], 1)
+            ax.set_title("double pendulum: the end of the lower arm")
+        elif name == "black hole":
+            ax.add_patch(Circle((0, 0), 2, color="black"))
+            ax.set_title("black hole: an orbit that precesses and shrinks")
+        else:
+            ax.set_title("charged particle: trap, fading field and drag")
+        colors = plt.get_cmap("viridis")(np.linspace(0, 1, 50))
+        for part, color in zip(
+            np.array_split(np.arange(len(q)), 50), colors, strict=True
+        ):
+            part = np.append(part, min(part[-1] + 1, len(q) - 1))
+            ax.plot(*q[part].T, color=color, lw=1)
+        ax.set(xlabel="x", ylabel="y")
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.grid(alpha=0.3)
+    fig.suptitle("Three nonseparable systems, from dark to bright as time goes on")
+    fig.savefig(path, dpi=90)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="a smaller run, for CI")
+    parser.add_argument("--output", type=pathlib.Path, default="nonseparable.png")
+    options = parser.parse_args()
+    table(options.quick)
+    against_newton()
+    picture(options.output)
+    print(f"\nPicture saved to {options.output}")
+
+
+if __name__ == "__main__":
+    main()
