@@ -192,7 +192,7 @@ def copy_distance(solver, y: State, solver_state) -> Inexact[Array, ""]:
 
     **Arguments:**
 
-    - `solver`: the solver, for example [`diffrax_presym.PresymplecticTao`][].
+    - `solver`: the solver, for example [`diffrax_presym.PresymplecticCoupled`][].
     - `y`: the state at the end of a solve.
     - `solver_state`: the solver state there, from `SaveAt(t1=True, solver_state=True)`.
 
@@ -200,9 +200,12 @@ def copy_distance(solver, y: State, solver_state) -> Inexact[Array, ""]:
 
     `ValueError` if the solver keeps no copies.
     """
+    # A composition carries what its base does.
+    while hasattr(solver, "base"):
+        solver = solver.base
     if not hasattr(solver, "distance"):
         raise ValueError(
             f"`{type(solver).__name__}` keeps no copies of the system, so there is no "
-            "distance between them. Use `PresymplecticTao()`, for example."
+            "distance between them. Use `PresymplecticCoupled()`, for example."
         )
     return solver.distance(y, solver_state)

@@ -24,7 +24,6 @@ Kind = Literal[
     "quadratic",  # a quadratic kinetic energy, and V(t, q)
     "augmented",  # anything; the solver state holds a copy `(q, p)` in `carry[0]`
     "coupled",  # anything; the solver state is half the difference of two copies
-    "projected",  # anything, and not symplectic
 ]
 
 
@@ -64,16 +63,7 @@ SCHEMES = [
         9,
         kind="augmented",
     ),
-    Scheme("coupled", dps.PresymplecticCoupled(), 2, 3, kind="coupled"),
     Scheme("coupled_4", dps.PresymplecticCoupled(4), 4, 11, kind="coupled"),
-    Scheme(
-        "projected_4",
-        dps.PresymplecticProjected(4),
-        4,
-        11,
-        symmetric=False,
-        kind="projected",
-    ),
 ]
 # One for each way through the code, from which the others differ by numbers alone.
 WAYS = [
@@ -93,7 +83,7 @@ WAYS = [
     }
 ]
 # Those that are explicit for any energy.
-ANY: tuple[Kind, ...] = ("augmented", "coupled", "projected")
+ANY: tuple[Kind, ...] = ("augmented", "coupled")
 
 # Schemes for any energy: those with frozen velocities, made implicit.
 _finder = optx.Newton(rtol=1e-12, atol=1e-12)

@@ -162,6 +162,16 @@ def projection_defect(h):
     return np.max(np.abs(J.T @ form @ J - float((T0 / (T0 + h)) ** 2) * form))
 
 
+def test_order_of_the_projection():
+    exact = flat(solve(WAVY, dps.PresymplecticCoupled(6), 1.0, 2.0, 1 / 64, Y0).ys)
+    solver, errors = dps.PresymplecticProjected(4), []
+    for n in (16, 24):
+        end = flat(solve(WAVY, solver, 1.0, 2.0, 1 / n, Y0).ys)
+        errors.append(np.max(np.abs(end - exact)))
+    assert abs(np.log(errors[0] / errors[1]) / np.log(1.5) - 4) < 0.3
+    assert not solver.is_symmetric
+
+
 def test_defect_of_the_projection_is_of_higher_order():
     defects = [projection_defect(h) for h in (1 / 8, 1 / 12)]
     slope = np.log(defects[0] / defects[1]) / np.log(1.5)

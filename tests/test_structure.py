@@ -12,6 +12,7 @@ import numpy as np
 import paper
 import pytest
 from helpers import (
+    ANY,
     assert_close,
     each,
     few,
@@ -30,8 +31,7 @@ import diffrax_presym as dps
 
 
 # The schemes with two copies, which are symplectic with both.
-AUGMENTED = [scheme for scheme in SCHEMES if scheme.kind in ("augmented", "coupled")]
-CONFORMAL = [scheme for scheme in SCHEMES if scheme.kind != "projected"]
+AUGMENTED = [scheme for scheme in SCHEMES if scheme.kind in ANY]
 NAMED = {scheme.name: scheme for scheme in SCHEMES}
 
 Q0, P0 = jnp.array([0.3, -0.2]), jnp.array([0.1, 0.4])
@@ -131,19 +131,19 @@ def contraction(eta):
     return float(np.exp(eta(T0) - eta(T1)))
 
 
-@few(DAMPINGS, CONFORMAL)
+@few(DAMPINGS, SCHEMES)
 def test_form_contracts_with_the_damping(scheme: Scheme, case):
     law, eta = DAMPINGS[case]
     assert structure_defect(quadratic(law), scheme, contraction(eta)) < 1e-13
 
 
-@each(CONFORMAL)
+@each()
 def test_form_contracts_under_unequal_damping(scheme: Scheme):
     # The frame is that of eta2.
     assert structure_defect(UNEQUAL, scheme, np.exp(-0.4 * 0.1)) < 1e-13
 
 
-@each(kinds=("frozen", "augmented", "coupled"))
+@each(kinds=("frozen", *ANY))
 def test_form_contracts_for_any_kinetic_energy(scheme: Scheme):
     law, eta = DAMPINGS["logarithmic"]
     hamiltonian = damped(swinging_kinetic, law)
