@@ -84,7 +84,7 @@ def main():
             ts, fs = values(mirror_map, objective, scaling, solver, q0, t1, h)
             ax.loglog(ts, fs, label=name, lw=1)
             scaled = ts**2 * fs
-            found = f"fails at t = {ts[-1]:.3g}, its copies apart"
+            found = f"fails at t = {ts[-1]:.3g}, where a copy leaves the simplex"
             if ts[-1] > t1 - h:
                 late = scaled[ts > t1 / 2].max()
                 found = (
