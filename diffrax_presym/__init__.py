@@ -36,6 +36,8 @@ from ._solver import (
     BlanesMoan6 as BlanesMoan6,
     BlanesMoanRKN4 as BlanesMoanRKN4,
     BlanesMoanRKN6 as BlanesMoanRKN6,
+    Checked as Checked,
+    Compensated as Compensated,
     Composition as Composition,
     PresymplecticCoupled as PresymplecticCoupled,
     PresymplecticEuler as PresymplecticEuler,

@@ -31,9 +31,25 @@ def cast_to(x: ArrayLike, like: ArrayLike) -> Array:
     return jnp.asarray(x, jnp.result_type(like))
 
 
+class Sum(eqx.Module):
+    """A number, and what rounding has taken from it so far: `value + lost` is meant."""
+
+    value: Array
+    lost: Array
+
+    def __add__(self, x: Array) -> "Sum":
+        # Exact whichever of the two is larger (Møller, Knuth).
+        x = x + self.lost
+        value = self.value + x
+        taken = value - self.value
+        return Sum(value, (self.value - (value - taken)) + (x - taken))
+
+
 def tree_add(y: PyTree, h: ArrayLike, dy: PyTree) -> PyTree:
     """`y + h * dy`, each leaf in its own precision."""
-    return jtu.tree_map(lambda yi, di: yi + cast_to(h, yi) * di, y, dy)
+    # Each leaf of `y` may be a `Sum`.
+    add = lambda di, yi: yi + cast_to(h, di) * di
+    return jtu.tree_map(add, dy, y)
 
 
 def tree_sub(x: PyTree, y: PyTree) -> PyTree:

@@ -15,9 +15,9 @@ from ._misc import cast_to, describe, tree_scale
 State = tuple[PyTree[Inexact[Array, "..."]], PyTree[Inexact[Array, "..."]]]
 
 
-# The closest there is to say of a state at which the energy is not defined. Older
+# Also the closest there is to say of a state at which the energy is not defined. Older
 # versions of Optimistix have no word for it.
-_INVALID: Any = getattr(dfx.RESULTS, "nonfinite", dfx.RESULTS.nonlinear_divergence)
+NONFINITE: Any = getattr(dfx.RESULTS, "nonfinite", dfx.RESULTS.nonlinear_divergence)
 
 
 class HamiltonianTerm(dfx.AbstractTerm):
@@ -101,7 +101,7 @@ class View(eqx.Module):
         valid = self.hamiltonian.is_valid(t, *y, self.args)
         if valid is None:
             return None
-        return dfx.RESULTS.where(valid, dfx.RESULTS.successful, _INVALID)
+        return dfx.RESULTS.where(valid, dfx.RESULTS.successful, NONFINITE)
 
     def force(self, t, y: State):
         return self._stored(self.hamiltonian.force(t, *y, self.args), t, y)

@@ -1,4 +1,6 @@
 from ._base import AbstractPresymplecticSolver as AbstractPresymplecticSolver
+from ._checked import Checked as Checked
+from ._compensated import Compensated as Compensated
 from ._composition import (
     Composition as Composition,
     PresymplecticYoshida4 as PresymplecticYoshida4,

@@ -1,0 +1,187 @@
+"""Solvers around solvers: digits that sums lose, and failures where they happen."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, henon_heiles, mixed_energy, oscillator, solve, step
+
+import diffrax_presym as dps
+
+
+# Older versions of Optimistix have no word for it.
+NONFINITE = getattr(dfx.RESULTS, "nonfinite", dfx.RESULTS.nonlinear_divergence)
+BASES = [
+    dps.PresymplecticLeapfrog("position"),
+    dps.PresymplecticLeapfrog(),
+    dps.Suzuki4(),
+    dps.BlanesMoanRKN4(),
+]
+each_base = pytest.mark.parametrize("base", BASES, ids=lambda x: type(x).__name__)
+HENON = dps.ConformalHamiltonian(
+    dps.QuadraticKinetic(jnp.array([1.0, 2.0])), henon_heiles, dps.ConstantDamping(0.3)
+)
+Y0 = (jnp.array([0.3, -0.1]), jnp.array([0.1, 0.2]))
+
+
+@each_base
+def test_compensated_is_the_same_scheme(base):
+    plain = step(HENON, base, 0.5, 0.6, Y0)
+    kept = step(HENON, dps.Compensated(base), 0.5, 0.6, Y0)
+    assert_close(kept[0], plain[0], 1e-15)
+    for name in ("k0", "k1"):
+        assert_close(kept[2][name], plain[2][name], 1e-14)
+    term = dps.HamiltonianTerm(HENON)
+    defect = dps.diagnostics.structure_defect(term, dps.Compensated(base), 0.5, 0.6, Y0)
+    assert defect < 1e-14
+
+
+@each_base
+def test_compensated_keeps_the_digits_of_float32(base):
+    # What is carried along is what the step in doubles has more.
+    y0 = jax.tree.map(lambda x: x.astype(jnp.float32), Y0)
+    t0, t1 = jnp.float32(0.0), jnp.float32(0.125)
+    exact, *_ = step(HENON, base, 0.0, 0.125, jax.tree.map(np.float64, y0))
+    y1, _, _, (_, lost), _ = step(HENON, dps.Compensated(base), t0, t1, y0)
+    assert all(x.dtype == jnp.float32 for x in jax.tree.leaves((y1, lost)))
+    kept = jax.tree.map(lambda x, e: np.float64(x) + np.float64(e), y1, lost)
+    error = lambda y: max(
+        np.max(np.abs(np.asarray(a, np.float64) - b))
+        for a, b in zip(y, exact, strict=True)
+    )
+    assert error(kept) < 3e-8
+    assert error(kept) < error(step(HENON, base, t0, t1, y0)[0])
+
+
+def test_compensated_error_grows_less():
+    # 3e4 steps of 1/8, of which every time is exact; errors of eight orbits, as one.
+    hamiltonian = oscillator(0.0)
+    q0 = jnp.linspace(0.3, 1.0, 8)
+    rms = {}
+    exact = None
+    for name, dtype, solver in (
+        ("exact", jnp.float64, dps.Substeps(BASES[1], 50)),
+        ("plain", jnp.float32, dps.Substeps(BASES[1], 50)),
+        ("kept", jnp.float32, dps.Compensated(dps.Substeps(BASES[1], 50), 6.25)),
+    ):
+        q = q0.astype(jnp.float32).astype(dtype)
+        t0, t1, dt0 = (jnp.asarray(t, dtype) for t in (0.0, 3750.0, 6.25))
+        sol = solve(hamiltonian, solver, t0, t1, dt0, (q, jnp.zeros_like(q)))
+        assert sol.ys is not None
+        end = np.asarray(jnp.stack(sol.ys), np.float64)
+        if exact is None:
+            exact = end
+        rms[name] = np.sqrt(np.mean((end - exact) ** 2))
+    assert rms["plain"] > 2e-6
+    assert rms["kept"] < rms["plain"] / 5
+
+
+def test_compensated_goes_on_from_its_state():
+    solver = dps.Compensated(BASES[1])
+    whole = solve(HENON, solver, 0.0, 2.0, 0.125, Y0)
+    save = dfx.SaveAt(t1=True, solver_state=True)
+    half = solve(HENON, solver, 0.0, 1.0, 0.125, Y0, saveat=save)
+    y = jax.tree.map(lambda x: x[-1], half.ys)
+    rest = solve(HENON, solver, 1.0, 2.0, 0.125, y, solver_state=half.solver_state)
+    assert_close(rest.ys, whole.ys, 1e-16)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_nominal_length_in_float32(sign):
+    # At t = 1e4 the difference of two times is off by a tenth; the length is not.
+    t0, h = jnp.float32(sign * 1e4), jnp.float32(0.01)
+    t1 = t0 + sign * h
+    assert abs(abs(t1 - t0) / h - 1) > 0.02
+    y0 = (jnp.float32(1.0), jnp.float32(0.5))
+    free = dps.SeparableHamiltonian(dps.QuadraticKinetic(), lambda t, q, args: 0 * q)
+    kept, *_ = step(free, dps.Compensated(BASES[1], h), t0, t1, y0)
+    assert_close(kept[0], jnp.float32(1 + sign * 0.005), 1e-7)
+    # A step that is cut short is as short as it is.
+    kept, *_ = step(free, dps.Compensated(BASES[1], 2 * h), t0, t1, y0)
+    assert_close(kept[0] - 1, (t1 - t0) / 2, 1e-7)
+
+
+def test_substeps_divide_the_jitter_of_the_clock():
+    free = dps.SeparableHamiltonian(dps.QuadraticKinetic(), lambda t, q, args: 0 * q)
+    y0 = (jnp.float32(0.0), jnp.float32(1.0))
+    t0, dt0 = jnp.float32(1e4), jnp.float32(0.01)
+    for n, error in ((1, (0.02, 0.1)), (100, (0.0, 1e-3))):
+        t1 = t0 + n * dt0
+        q = step(free, dps.Substeps(BASES[1], n), t0, t1, y0)[0][0]
+        assert error[0] <= abs(q / (n * dt0) - 1) <= error[1]
+
+
+def test_compensated_gradients():
+    @jax.jit
+    def end(x):
+        sol = dfx.diffeqsolve(
+            dps.HamiltonianTerm(HENON),
+            dps.Compensated(dps.BlanesMoanRKN4()),
+            0.0,
+            1.0,
+            0.25,
+            (x * Y0[0], Y0[1]),
+        )
+        assert sol.ys is not None
+        return jnp.sum(sol.ys[0] ** 2)
+
+    at, h = jnp.asarray(1.0), 1e-6
+    numeric = (end(at + h) - end(at - h)) / (2 * h)
+    assert_close(jax.grad(end)(at), numeric, 1e-8)
+
+
+def explodes(t, q, args):
+    """Not defined beyond `args`."""
+    return -jnp.sum(jnp.sqrt(args - q))
+
+
+def cubic(t, q, args):
+    return -args * jnp.sum(q**4)
+
+
+@pytest.mark.parametrize("base", BASES[1:3])
+@pytest.mark.parametrize("potential, args", [(explodes, 0.5), (cubic, 1e3)])
+def test_checked_reports(base, potential, args):
+    hamiltonian = dps.SeparableHamiltonian(dps.QuadraticKinetic(), potential)
+    y0 = (jnp.array([0.3]), jnp.array([3.0]))
+    run = lambda solver, **kwargs: solve(
+        hamiltonian, solver, 0.0, 10.0, 0.1, y0, jnp.asarray(args), **kwargs
+    )
+    sol = run(dps.Checked(base), throw=False)
+    assert sol.result == NONFINITE
+    assert sol.stats["num_steps"] < 100
+    unchecked = run(base)
+    assert unchecked.ys is not None
+    assert not np.all(np.isfinite(unchecked.ys[0]))
+
+
+def test_checked_raises_and_counts_the_first_failure():
+    hamiltonian = dps.SeparableHamiltonian(dps.QuadraticKinetic(), cubic)
+    y0 = (jnp.array([0.3]), jnp.array([1.0]))
+    with pytest.raises(eqx.EquinoxRuntimeError, match=r"Nonfinite|diverged"):
+        solve(hamiltonian, dps.Checked(BASES[1]), 0.0, 9.0, 0.1, y0, jnp.asarray(1e3))
+
+
+def test_checked_is_the_same_scheme():
+    checked = step(HENON, dps.Checked(BASES[2]), 0.5, 0.6, Y0)
+    plain = step(HENON, BASES[2], 0.5, 0.6, Y0)
+    assert_close(checked[0], plain[0], 0)
+    assert checked[4] == dfx.RESULTS.successful
+
+
+def test_errors():
+    for wrapper in (dps.Checked, dps.Compensated):
+        with pytest.raises(ValueError, match="must be a presymplectic solver"):
+            wrapper(dfx.Tsit5())  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="positive"):
+        dps.Compensated(BASES[1], -0.1)
+    with pytest.raises(ValueError, match="separable"):
+        step(
+            dps.Hamiltonian(mixed_energy),
+            dps.Compensated(dps.PresymplecticTao()),
+            0.0,
+            0.1,
+            Y0,
+        )
