@@ -87,9 +87,11 @@ class LogDamping(AbstractDamping):
     (eta1_small) of França, Jordan and Vidal (2021); with $s = 1$ their decaying
     oscillator.
 
-    The rate is infinite at $t = -s$. Schemes whose stages leave the step, such as
-    [`diffrax_presym.PresymplecticYoshida4`][], need a start further from there than the
-    stages reach.
+    The rate is infinite at $t = -s$, where positive damping holds a system at rest: a
+    solve may start there, from zero momentum. Schemes whose stages leave the step, such
+    as [`diffrax_presym.PresymplecticYoshida4`][], need a start further from there than
+    the stages reach; else the solve is `nan`, which [`diffrax_presym.Checked`][]
+    reports.
     """
 
     gamma: Scalar
@@ -117,8 +119,12 @@ class LogDamping(AbstractDamping):
     def integral(self, t: Time, h: Time, order: int) -> Scalar:
         # With x = log((s + h) / s) it is s (exp((1 - gamma) x) - 1) / (1 - gamma).
         since = t + cast_to(self.shift, t)
+        # At the singularity itself all momentum is lost before it carries anywhere.
+        singular = since == 0
+        since = jnp.where(singular, 1, since)
         growth = jnp.log1p(h / since)
-        return since * growth * _expm1_ratio((1 - cast_to(self.gamma, t)) * growth)
+        carried = since * growth * _expm1_ratio((1 - cast_to(self.gamma, t)) * growth)
+        return jnp.where(singular, 0, carried)
 
 
 class MixedDamping(AbstractDamping):
