@@ -1,6 +1,7 @@
 """Presymplectic integrators for Diffrax."""
 
 from . import diagnostics as diagnostics
+from ._adjoint import ReversibleAdjoint as ReversibleAdjoint
 from ._hamiltonian import (
     AbstractDamping as AbstractDamping,
     AbstractHamiltonian as AbstractHamiltonian,

@@ -9,6 +9,7 @@ from typing import ClassVar, Generic, Literal, TYPE_CHECKING, TypeVar
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -50,6 +51,11 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
     def is_symmetric(self) -> bool:
         """Whether a step backwards undoes a step."""
 
+    @property
+    def reverse(self) -> "AbstractPresymplecticSolver[_Carry] | None":
+        """The scheme a step of which, backwards, undoes a step of this one, if any."""
+        return self if self.is_symmetric else None
+
     @abc.abstractmethod
     def order(self, terms) -> int:
         """The order of the scheme."""
@@ -88,20 +94,42 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         h = t1 - t0
         y1, new_carry, result = self.advance(system, t0, t1, h, y0, carry)
         result = first_failure(result, system.check(t1, y1))
-        slope0 = self.slope(system, t0, y0, carry)
-        slope1 = self.slope(system, t1, y1, new_carry)
-        dense_info = dict(
-            y0=y0, y1=y1, k0=tree_scale(h, slope0), k1=tree_scale(h, slope1)
-        )
-        if self.order(terms) > 4:
-            bend0 = system.bend(t0, y0, slope0)
-            bend1 = system.bend(t1, y1, slope1)
-            dense_info |= dict(b0=tree_scale(h**2, bend0), b1=tree_scale(h**2, bend1))
+        ends = (y0, carry), (y1, new_carry)
+        dense_info = self.dense_info(system, t0, t1, h, *ends)
         result = dfx.RESULTS.successful if result is None else result
         return y1, None, dense_info, new_carry, result
 
+    def dense_info(self, view: View, t0, t1, h, start, end) -> dict[str, State]:
+        """What the interpolation of a step needs to know of its two ends."""
+        (y0, _), (y1, _) = start, end
+        slope0, slope1 = self.slope(view, t0, *start), self.slope(view, t1, *end)
+        info = dict(y0=y0, y1=y1, k0=tree_scale(h, slope0), k1=tree_scale(h, slope1))
+        # No scheme needs to look at the term to know its order.
+        if self.order(None) > 4:
+            bend0, bend1 = view.bend(t0, y0, slope0), view.bend(t1, y1, slope1)
+            info |= dict(b0=tree_scale(h**2, bend0), b1=tree_scale(h**2, bend1))
+        return info
+
+    def pull_back(self, view: View, wanted: PyTree, t0, t1, h, end, bar):
+        """Undo a step, and pull cotangents back through it.
+
+        From the state and what is carried at its `end`, and the cotangents of these,
+        to those at its start; and the cotangents of what is `wanted` of the view.
+        """
+        undo = lambda end: self.reverse.advance(view, t1, t0, -h, *end)[:2]
+        redo = lambda view, start: self.advance(view, t0, t1, h, *start)[:2]
+        return pull_back(undo, redo, view, wanted, end, bar)
+
     def func(self, terms, t0, y0, args):
         return terms.vf(t0, y0, args)
+
+
+def pull_back(undo, redo, view: View, wanted: PyTree, end, bar):
+    """The same for any move `redo`, of which `undo` is the inverse."""
+    start = undo(end)
+    moved, rest = eqx.partition(view, wanted)
+    again = lambda moved, start: redo(eqx.combine(moved, rest), start)
+    return start, *jax.vjp(again, moved, start)[1](bar)
 
 
 class Clock(eqx.Module):

@@ -75,6 +75,13 @@ class AbstractComposition(AbstractPresymplecticSolver[PyTree]):
     def is_symmetric(self) -> bool:
         return self.base.is_symmetric and self.weights == self.weights[::-1]
 
+    @property
+    def reverse(self) -> "AbstractComposition | None":
+        if self.is_symmetric or self.base.reverse is None:
+            return self if self.is_symmetric else None
+        weights = self.weights[::-1]
+        return _Reversed(self.base.reverse, weights, self)
+
     def start(self, view: View, t, y: State):
         return self.base.start(view, t, y)
 
@@ -95,8 +102,34 @@ class AbstractComposition(AbstractPresymplecticSolver[PyTree]):
             results = jtu.tree_map(lambda x: x[failed], results)
         return y, carry, results
 
+    def pull_back(self, view: View, wanted: PyTree, t0, t1, h, end, bar):
+        clock = Clock(t0, t1, h)
+        gradient = jtu.tree_map(jnp.zeros_like, eqx.filter(view, wanted))
+
+        # Stage by stage, so that none is run more often than it must be.
+        def stage(state, moves):
+            end, bar, gradient = state
+            t0, t1, weight = moves
+            times = clock(t0), clock(t1), weight * h
+            end, more, bar = self.base.pull_back(view, wanted, *times, end, bar)
+            return (end, bar, jtu.tree_map(jnp.add, gradient, more)), None
+
+        stages = stage_table(self.weights, h)
+        state = (end, bar, gradient)
+        (start, bar, gradient), _ = lax.scan(stage, state, stages, reverse=True)
+        return start, gradient, bar
+
     def slope(self, view: View, t, y: State, carry: PyTree) -> State:
         return self.base.slope(view, t, y, carry)
+
+
+class _Reversed(AbstractComposition):
+    base: AbstractPresymplecticSolver
+    weights: Weights = eqx.field(static=True)
+    original: AbstractComposition
+
+    def order(self, terms):
+        return self.original.order(terms)
 
 
 class Composition(AbstractComposition):

@@ -30,6 +30,11 @@ class PresymplecticEuler(AbstractKickDriftSolver[None]):
     def is_symmetric(self) -> bool:
         return False
 
+    @property
+    def reverse(self) -> "PresymplecticEuler":
+        other = "position" if self.first == "momentum" else "momentum"
+        return PresymplecticEuler(other, self.root_finder, self.root_find_max_steps)
+
     def order(self, terms):
         return 1
 

@@ -36,6 +36,15 @@ class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
     def is_symmetric(self) -> bool:
         return self.tableau.fractions == self.tableau.fractions[::-1]
 
+    @property
+    def reverse(self) -> "AbstractSplitting":
+        backwards = self.tableau.fractions[::-1]
+        return (
+            self
+            if self.is_symmetric
+            else Splitting(self.tableau._replace(fractions=backwards))
+        )
+
     def order(self, terms):
         return self.tableau.order
 
