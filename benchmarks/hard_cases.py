@@ -699,7 +699,7 @@ def pictures(series, growth, folder):
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer steps and orbits")
-    parser.add_argument("--only", help="one group, by the name of its function")
+    parser.add_argument("--only", nargs="+", help="groups, by their functions")
     parser.add_argument("--pictures", type=pathlib.Path, help="folder to save them to")
     options = parser.parse_args()
     groups = (
@@ -718,9 +718,9 @@ def main():
     )
     out = {}
     for group in groups:
-        if options.only in (None, group.__name__):
+        if options.only is None or group.__name__ in options.only:
             out[group.__name__] = group(options.quick)
-    if options.pictures and options.only is None:
+    if options.pictures and {"kepler", "long_times"} <= set(out):
         pictures(out["kepler"], out["long_times"], options.pictures)
 
 
