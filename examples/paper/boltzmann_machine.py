@@ -305,7 +305,7 @@ def picture(temperatures, observed, losses, every, shown):
             ax.plot(temperatures, observed[name][i], **look)
         ax.axvline(ising.CRITICAL_TEMPERATURE, color="0.8", lw=0.8)
         ax.set(xlabel="temperature T", ylabel=f"{label} per spin")
-    axes[0].legend(fontsize=8)
+    axes[0].legend(fontsize=8, loc="lower right")
     for name, curve in losses.items():
         axes[2].semilogy(every * np.arange(1, len(curve) + 1), curve, label=name)
     axes[2].set(
