@@ -263,9 +263,11 @@ class _WayBack:
         gradient = jtu.tree_map(jnp.zeros_like, self.moved)
         place = _Place(n, self.time(n), (y, carry), bar, gradient, self.left)
         for i, sub in enumerate(self.subs):
-            # It may have been saved as a step already.
-            if sub.t1 and sub.steps != 1:
-                place = self.unsave(place, i, sub.steps == 0 or n % sub.steps != 0)
+            # The last may have been saved as a step already; Diffrax counts it twice.
+            if sub.steps > 1:
+                place = self.unsave(place, i, sub.t1 & (n % sub.steps != 0), 1)
+            elif sub.t1 and sub.steps == 0:
+                place = self.unsave(place, i, True)
         return place
 
     def start(self, place: _Place) -> _Place:
@@ -276,10 +278,10 @@ class _WayBack:
             place = self.add(place, self.pull_saved(i, place.t, place.state[0], bar))
         return place
 
-    def unsave(self, place: _Place, i: int, pred) -> _Place:
+    def unsave(self, place: _Place, i: int, pred, counted=None) -> _Place:
         """Take back the last that was saved, if it was saved here."""
         times, left = place.left[i]
-        left = left - jnp.where(pred, 1, 0)
+        left = left - (jnp.where(pred, 1, 0) if counted is None else counted)
         bar = jtu.tree_map(lambda x: jnp.where(pred, x[left], 0), self.saved[i])
         place = self.add(place, self.pull_saved(i, place.t, place.state[0], bar))
         return place._replace(
