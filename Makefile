@@ -14,7 +14,7 @@ EXAMPLES := $(sort $(filter-out examples/_%,$(wildcard examples/*.py)))
 # The experiments of the paper share code, so they are run as modules.
 PAPER := $(notdir $(basename $(filter-out examples/paper/_%,$(wildcard examples/paper/*.py))))
 BENCHMARKS := against_loop compile_time schemes work_precision batches nonseparable \
-	hard_cases
+	hard_cases gradients
 
 # No window is ever opened: figures go to files.
 export MPLBACKEND ?= Agg

@@ -1,7 +1,10 @@
 """Gradients by running the scheme backwards, against all other ways to get them."""
 
+from typing import Any
+
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -46,9 +49,9 @@ def add_up(tree):
     return sum(jtu.tree_leaves(jtu.tree_map(leaf, tree)), jnp.zeros(()))
 
 
-def solve(inputs, adjoint, solver=LEAPFROG, system=separable, **kwargs):
+def solve(inputs, adjoint, solver: Any = LEAPFROG, system=separable, **kwargs):
     y0, gamma, stiffness = inputs
-    times = dict(t0=0.0, t1=1.0, dt0=0.1, saveat=dfx.SaveAt(t1=True), max_steps=64)
+    times: dict[str, Any] = dict(t0=0.0, t1=1.0, dt0=0.1, max_steps=64)
     return dfx.diffeqsolve(
         dps.HamiltonianTerm(system(gamma)),
         solver,
@@ -142,10 +145,119 @@ def test_cotangents_of_all_that_is_saved(saveat):
 
 def test_step_to_and_splitting_dense_output():
     ts = jnp.array([0.0, 0.1, 0.3, 0.35, 1.0])
-    kwargs = dict(dt0=None, stepsize_controller=dfx.StepTo(ts))
+    kwargs: dict[str, Any] = dict(dt0=None, stepsize_controller=dfx.StepTo(ts))
     check(saveat=dfx.SaveAt(ts=TS), solver=dps.BlanesMoanRKN6(), **kwargs)
 
 
 def test_without_max_steps():
     ours = value_and_gradient(INPUTS, REVERSIBLE, dict(max_steps=None))
     assert_close(ours, value_and_gradient(INPUTS, CHECKPOINTED, {}), 1e-12)
+
+
+def undriven(t, q, args):
+    return jnp.sum(1 - jnp.cos(q))
+
+
+def strongly_damped(adjoint, eta, dtype: Any = jnp.float64):
+    """The gradient of a solve that damps by `eta` e-folds, a trap for reversal."""
+
+    @jax.jit
+    @jax.grad
+    def gradient(inputs):
+        q0, gamma = inputs
+        term = dps.HamiltonianTerm(
+            dps.ConformalHamiltonian(
+                dps.QuadraticKinetic(), undriven, dps.ConstantDamping(gamma)
+            )
+        )
+        # Every step counts: what is left at the end has forgotten the start.
+        saveat = dfx.SaveAt(ts=jnp.linspace(0.0, 4.0, 20, dtype=dtype))
+        t0, t1, dt0 = (jnp.asarray(t, dtype) for t in (0.0, 100.0, 1 / 16))
+        y0 = q0, jnp.zeros_like(q0)
+        options: dict[str, Any] = dict(adjoint=adjoint, saveat=saveat, max_steps=1600)
+        sol = dfx.diffeqsolve(term, LEAPFROG, t0, t1, dt0, y0, **options)
+        return sum(jnp.sum(y**2) for y in jtu.tree_leaves(sol.ys))
+
+    return gradient((jnp.array([1.0, 0.3], dtype), jnp.asarray(eta / 100, dtype)))
+
+
+@pytest.mark.parametrize("eta", [10.0, 100.0, 1000.0])
+def test_kept_states_make_up_for_what_damping_forgets(eta):
+    exact = strongly_damped(CHECKPOINTED, eta)
+    assert_close(strongly_damped(REVERSIBLE, eta), exact, 1e-10)
+
+
+def test_kept_states_in_single_precision():
+    exact = strongly_damped(CHECKPOINTED, 100.0)
+    single = strongly_damped(REVERSIBLE, 100.0, jnp.float32)
+    assert all(x.dtype == jnp.float32 for x in jtu.tree_leaves(single))
+    assert_close(single, exact, 1e-4)
+
+
+def test_a_gradient_that_is_off_is_an_error():
+    for checkpoints, eta in ((0, 100.0), (2, 1000.0)):
+        adjoint = dps.ReversibleAdjoint(checkpoints=checkpoints)
+        with pytest.raises(Exception, match="Keep more states"):
+            jax.block_until_ready(strongly_damped(adjoint, eta))
+    assert_close(
+        strongly_damped(dps.ReversibleAdjoint(checkpoints=0), 1.0),
+        strongly_damped(CHECKPOINTED, 1.0),
+        1e-11,
+    )
+
+
+def test_gradients_of_a_batch():
+    batch = jtu.tree_map(lambda x: jnp.stack([x, 0.9 * x]), INPUTS)
+
+    def gradient(inputs):
+        return jax.grad(lambda x: add_up(solve(x, REVERSIBLE).ys))(inputs)
+
+    together = jax.jit(jax.vmap(gradient))(batch)
+    for i in range(2):
+        alone = gradient(jtu.tree_map(lambda x, i=i: x[i], batch))
+        assert_close(jtu.tree_map(lambda x, i=i: x[i], together), alone, 1e-13)
+
+
+def test_second_derivatives_by_forward_over_reverse():
+    def hessian_vector(adjoint):
+        gradient = jax.grad(lambda x: add_up(solve(x, adjoint).ys) ** 2)
+        return jax.jit(lambda x, v: jax.jvp(gradient, (x,), (v,))[1])(INPUTS, INPUTS)
+
+    exact = hessian_vector(dfx.DirectAdjoint())
+    assert_close(hessian_vector(REVERSIBLE), exact, 1e-11)
+
+
+def controlled(controller: Any, event: Any = None):
+    return solve(INPUTS, REVERSIBLE, stepsize_controller=controller, event=event)
+
+
+@pytest.mark.parametrize(
+    "wrong, what",
+    [
+        (lambda: solve(INPUTS, REVERSIBLE, dfx.Tsit5()), "Tsit5"),
+        (
+            lambda: solve(INPUTS, REVERSIBLE, dps.PresymplecticProjected()),
+            "PresymplecticProjected",
+        ),
+        (
+            lambda: controlled(
+                dfx.ConstantStepSize(), dfx.Event(lambda t, y, args, **kwargs: t > 2)
+            ),
+            "events",
+        ),
+        (
+            lambda: jax.grad(lambda t: add_up(solve(INPUTS, REVERSIBLE, t1=t).ys))(1.0),
+            "times",
+        ),
+    ],
+    ids=["solver", "projected", "event", "time"],
+)
+def test_what_is_not_supported_names_what_is(wrong, what):
+    with pytest.raises(ValueError, match=f"{what}.*RecursiveCheckpointAdjoint"):
+        wrong()
+
+
+@pytest.mark.parametrize("kwargs", [dict(checkpoints=-1), dict(tol=0.0)])
+def test_bad_options(kwargs):
+    with pytest.raises(ValueError, match=next(iter(kwargs))):
+        dps.ReversibleAdjoint(**kwargs)

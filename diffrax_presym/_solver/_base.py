@@ -116,7 +116,9 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         From the state and what is carried at its `end`, and the cotangents of these,
         to those at its start; and the cotangents of what is `wanted` of the view.
         """
-        undo = lambda end: self.reverse.advance(view, t1, t0, -h, *end)[:2]
+        reverse = self.reverse
+        assert reverse is not None
+        undo = lambda end: reverse.advance(view, t1, t0, -h, *end)[:2]
         redo = lambda view, start: self.advance(view, t0, t1, h, *start)[:2]
         return pull_back(undo, redo, view, wanted, end, bar)
 
