@@ -18,7 +18,6 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
 from ._misc import as_positive
-from ._solver import AbstractPresymplecticSolver
 from ._term import View, view
 
 
@@ -122,7 +121,8 @@ def _refuse(what: str) -> str:
 
 
 def _check(solver, controller, event) -> None:
-    if not isinstance(solver, AbstractPresymplecticSolver) or solver.reverse is None:
+    # Diffrax's wrappers of solvers pass for what they wrap, but have no reverse.
+    if getattr(solver, "reverse", None) is None:
         what = f"`{type(solver).__name__}`, of which no reverse is known"
         raise ValueError(_refuse(what))
     if type(controller) not in (dfx.ConstantStepSize, dfx.StepTo):
@@ -151,7 +151,7 @@ _hamiltonian = lambda terms: terms.term.hamiltonian
 _start = lambda state: (state.y, state.solver_state, state.made_jump)
 
 
-def _run(inputs: _Inputs):
+def _forward(inputs: _Inputs):
     """Diffrax's own loop, as for a solve without gradients."""
     system, fns = inputs.parameters
     init_state, saveat = inputs.rest["init_state"], inputs.rest["saveat"]
@@ -174,8 +174,7 @@ def _run(inputs: _Inputs):
 
 @eqx.filter_custom_vjp
 def _solve(inputs: _Inputs, adjoint: ReversibleAdjoint):
-    del adjoint
-    return _run(inputs)
+    return _forward(inputs)
 
 
 @_solve.def_fwd
@@ -187,7 +186,8 @@ def _solve_fwd(perturbed: _Inputs, inputs: _Inputs, adjoint: ReversibleAdjoint):
                 "solver"
             )
         )
-    out = _run(inputs)
+    # Not `_solve`, so that forward mode can be taken of this.
+    out = _forward(inputs)
     return out, out[0]
 
 
@@ -213,7 +213,8 @@ def _solve_bwd(final, cotangents, perturbed: _Inputs, inputs: _Inputs, adjoint):
     start, miss, _ = lax.while_loop(again, attempt, nothing)
     start = way.start(start)
     # A solve that diverged has a gradient of NaN anyway.
-    missed = ~(miss <= tol) & jnp.isfinite(miss)
+    finite = [jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(final.y)]
+    missed = ~(miss <= tol) & jnp.all(jnp.stack(finite))
     bar, gradient = eqx.error_if(
         (start.bar, start.gradient),
         missed,
@@ -253,10 +254,9 @@ class _WayBack:
         # What is saved, for each of `SaveAt(subs=...)`, and its cotangents.
         saveat = rest["saveat"]
         structure = jtu.tree_structure(saveat.subs, is_leaf=_is_sub)
-        saves = structure.flatten_up_to(final.save_state)
+        self.saves = saves = structure.flatten_up_to(final.save_state)
         bars = structure.flatten_up_to(cotangents.save_state)
         self.subs = _subs(saveat)
-        self.left = [(save.saveat_ts_index, save.save_index) for save in saves]
         self.saved = [
             _materialise(save.ys, bar.ys) for save, bar in zip(saves, bars, strict=True)
         ]
@@ -267,13 +267,17 @@ class _WayBack:
         y, carry, n = self.final.y, self.final.solver_state, self.final.num_steps
         bar = jtu.tree_map(jnp.zeros_like, y), self.carried
         gradient = jtu.tree_map(jnp.zeros_like, self.moved)
-        place = _Place(n, self.time(n), (y, carry), bar, gradient, self.left)
+        left = [
+            _saved(sub, save, n)
+            for sub, save in zip(self.subs, self.saves, strict=True)
+        ]
+        place = _Place(n, self.time(n), (y, carry), bar, gradient, left)
         for i, sub in enumerate(self.subs):
-            # The last may have been saved as a step already; Diffrax counts it twice.
-            if sub.steps > 1:
-                place = self.unsave(place, i, sub.t1 & (n % sub.steps != 0), 1)
-            elif sub.t1 and sub.steps == 0:
-                place = self.unsave(place, i, True)
+            # It may have been saved as a step already.
+            if sub.t1 and sub.steps != 1:
+                here = sub.steps == 0 or n % sub.steps != 0
+                bar = self.saved_at(i, left[i][1], here)
+                place = self.add(place, self.pull_saved(i, place.t, y, bar))
         return place
 
     def start(self, place: _Place) -> _Place:
@@ -284,15 +288,18 @@ class _WayBack:
             place = self.add(place, self.pull_saved(i, place.t, place.state[0], bar))
         return place
 
-    def unsave(self, place: _Place, i: int, pred, counted=None) -> _Place:
+    def unsave(self, place: _Place, i: int, pred) -> _Place:
         """Take back the last that was saved, if it was saved here."""
         times, left = place.left[i]
-        left = left - (jnp.where(pred, 1, 0) if counted is None else counted)
-        bar = jtu.tree_map(lambda x: jnp.where(pred, x[left], 0), self.saved[i])
+        left = left - jnp.where(pred, 1, 0)
+        bar = self.saved_at(i, left, pred)
         place = self.add(place, self.pull_saved(i, place.t, place.state[0], bar))
         return place._replace(
             left=[*place.left[:i], (times, left), *place.left[i + 1 :]]
         )
+
+    def saved_at(self, i: int, index, pred):
+        return jtu.tree_map(lambda x: jnp.where(pred, x[index], 0), self.saved[i])
 
     def pull_saved(self, i: int, t, y, bar):
         """From what was saved of `y` to the parameters and `y` itself."""
@@ -394,15 +401,16 @@ class _WayBack:
         )
         states = lax.fori_loop(1, parts, keep, states)
         # Units in which positions and momenta compare: the largest there are of each.
+        # What is carried besides may be all rounding, and is not compared.
         units = jtu.tree_map(
-            lambda x, y: jnp.maximum(_largest(x), _largest(y)), states, place.state
+            lambda x, y: jnp.maximum(_largest(x), _largest(y)),
+            *(states[0], place.state[0]),
         )
 
         def size(state):
             scaled = jtu.tree_map(
                 lambda x, u: (_largest(x) / jnp.where(u > 0, u, 1)).astype(float),
-                state,
-                units,
+                *(state[0], units),
             )
             return jtu.tree_reduce(jnp.maximum, scaled)
 
@@ -453,6 +461,19 @@ def _materialise(like: PyTree, bar: PyTree) -> PyTree:
 
 def _largest(x: Array) -> Array:
     return jnp.max(jnp.abs(x), initial=0)
+
+
+def _saved(sub: dfx.SubSaveAt, save, n) -> tuple[Array, Array]:
+    """How much of `ts`, and how much in all, was saved before the end of the solve.
+
+    Counted anew: what Diffrax counts may include an end that was not saved.
+    """
+    times = jnp.asarray(0)
+    if sub.ts is not None:
+        # A solve of no length saves them all without counting.
+        times = jnp.where(n == 0, len(sub.ts), save.saveat_ts_index)
+    steps = 0 if sub.steps == 0 else n // sub.steps
+    return times, times + steps + int(sub.t0)
 
 
 def _sum_of_first(n: Array, x: Array) -> Array:

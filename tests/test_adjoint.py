@@ -240,6 +240,10 @@ def controlled(controller: Any, event: Any = None):
             "PresymplecticProjected",
         ),
         (
+            lambda: solve(INPUTS, REVERSIBLE, dfx.HalfSolver(LEAPFROG)),
+            "HalfSolver",
+        ),
+        (
             lambda: controlled(
                 dfx.ConstantStepSize(), dfx.Event(lambda t, y, args, **kwargs: t > 2)
             ),
@@ -250,7 +254,7 @@ def controlled(controller: Any, event: Any = None):
             "times",
         ),
     ],
-    ids=["solver", "projected", "event", "time"],
+    ids=["solver", "projected", "adaptive", "event", "time"],
 )
 def test_what_is_not_supported_names_what_is(wrong, what):
     with pytest.raises(ValueError, match=f"{what}.*RecursiveCheckpointAdjoint"):
