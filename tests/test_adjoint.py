@@ -98,6 +98,7 @@ def test_implicit_schemes_reverse_too(scheme: Scheme):
     "solver",
     [
         dps.BlanesMoanRKN4(),
+        dps.BlanesMoan4(),
         dps.Substeps(dps.PresymplecticEuler(), 3),
         dps.Splitting(dps.SplittingTableau(1, True, False, (0.3, 1.0, 0.7))),
     ],

@@ -2,13 +2,16 @@ import math
 from typing import ClassVar, TYPE_CHECKING
 
 import equinox as eqx
+import jax
 import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
 from .._misc import cast_to, tree_add
 from .._term import State, View
-from ._base import AbstractPresymplecticSolver, Clock, stage_table
+from ._base import AbstractPresymplecticSolver, Clock, pull_back, stage_table
 from ._tableaus import (
     BLANES_CASAS_RKN_8,
     BLANES_MOAN_4,
@@ -77,6 +80,60 @@ class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
             start, _, drift = (x[-1] for x in table)
             y = view.drift(clock(start), drift * h, y, order)
         return y, carry, None
+
+    def pull_back(self, view: View, wanted: PyTree, t0, t1, h, end, bar):
+        self._check(view)
+        fractions, kick_first = self.tableau.fractions, self.tableau.kick_first
+        clock, order = Clock(t0, t1, h), self.tableau.order
+        drifts, kicks = fractions[kick_first::2], fractions[1 + kick_first :: 2]
+        table = stage_table(drifts, h)
+        gradient = jtu.tree_map(jnp.zeros_like, eqx.filter(view, wanted))
+        (y, force), (y_bar, force_bar) = end, bar
+
+        # Move by move, as `advance` made them, so that none is made more often than it
+        # must be.
+        def drift(start, end, length):
+            there = lambda view, y: view.drift(clock(start), length * h, y, order)
+            back = lambda y: view.drift(clock(end), -length * h, y, order)
+            return back, there
+
+        def stage(state, moves):
+            (y, y_bar, force_bar), gradient = state
+            *times, impulse = moves
+            back, there = drift(*times)
+            t = clock(times[1])
+
+            def undo(y):
+                return back(kick(y, -impulse * h, view.potential_force(t, y)))
+
+            def redo(view, y):
+                y = there(view, y)
+                force = view.potential_force(t, y)
+                return kick(y, impulse * h, force), force
+
+            pulled = pull_back(undo, redo, view, wanted, y, (y_bar, force_bar))
+            y, more, y_bar = pulled
+            # Only the last force is carried on.
+            none = jtu.tree_map(jnp.zeros_like, force_bar)
+            return ((y, y_bar, none), _add(gradient, more)), None
+
+        if not kick_first:
+            pulled = pull_back(*drift(*(x[-1] for x in table)), view, wanted, y, y_bar)
+            y, more, y_bar = pulled
+            gradient = _add(gradient, more)
+            force_bar = jtu.tree_map(jnp.zeros_like, y[1])
+        paired = *(x[: len(kicks)] for x in table), cast_to(np.array(kicks), h)
+        state = (y, y_bar, force_bar), gradient
+        ((y, y_bar, _), gradient), _ = lax.scan(stage, state, paired, reverse=True)
+        if kick_first:
+            force = view.potential_force(t0, y)
+            first = fractions[0] * h
+            y = kick(y, -first, force)
+            _, pull = jax.vjp(lambda y, force: kick(y, first, force), y, force)
+            y_bar, force_bar = pull(y_bar)
+        else:
+            force, force_bar = end[1], bar[1]
+        return (y, force), gradient, (y_bar, force_bar)
 
     def slope(self, view: View, t, y: State, carry: PyTree) -> State:
         # What is carried is all of the force only if none of it is kinetic.
@@ -280,6 +337,10 @@ class BlanesCasasRKN8(AbstractSplitting):
     """
 
     tableau: ClassVar[SplittingTableau] = BLANES_CASAS_RKN_8
+
+
+def _add(x: PyTree, y: PyTree) -> PyTree:
+    return jtu.tree_map(jnp.add, x, y)
 
 
 def kick(y: State, h, force: PyTree) -> State:
