@@ -95,9 +95,9 @@ def compiled(loss, n):
     return jax.jit(loss).lower(*problem(n)).compile()
 
 
-def seconds(program, n):
+def seconds(program, inputs):
     start = time.perf_counter()
-    jax.block_until_ready(program(*problem(n)))
+    jax.block_until_ready(program(*inputs))
     return time.perf_counter() - start
 
 
@@ -107,6 +107,7 @@ def times(sizes, counts, repeats):
     print(f"{'unknowns':>9} {'steps':>7} {'solve, ms':>10}", end="")
     print("".join(f"{name:>14}" for name in names))
     for n in sizes:
+        inputs = problem(n)
         for steps in counts:
             if n * steps > MOST["reversible"]:
                 continue
@@ -116,9 +117,9 @@ def times(sizes, counts, repeats):
                 if n * steps <= MOST.get(name, MOST["reversible"])
             }
             for program in programs.values():
-                seconds(program, n)
+                seconds(program, inputs)
             rounds = [
-                {name: seconds(program, n) for name, program in programs.items()}
+                {name: seconds(program, inputs) for name, program in programs.items()}
                 for _ in range(repeats)
             ]
             median = {
