@@ -676,7 +676,7 @@ def pictures(series, growth, folder):
         ylabel="largest energy error per stretch",
         title="Kepler orbit, e = 0.9",
     )
-    ax.legend(loc="center right", fontsize="small")
+    ax.legend(loc="lower right", fontsize="small")
     ax.grid(alpha=0.3)
     fig.savefig(folder / "hard_cases_kepler.png", dpi=110)
     fig, ax = plt.subplots(figsize=(7, 4), layout="constrained")
