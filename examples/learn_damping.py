@@ -72,6 +72,7 @@ def objectives(damping, batch, steps):
         adjoint=dps.ReversibleAdjoint(),
         max_steps=steps,
     )
+    assert sol.ys is not None
     return sol.ys - sol.ys[0]
 
 
