@@ -81,8 +81,10 @@ def test_boolean_event_ends_with_the_step(exact):
     assert sol.result == dfx.RESULTS.event_occurred
 
 
-@pytest.mark.parametrize("adjoint", [dfx.DirectAdjoint(), None])
-@pytest.mark.parametrize("solver", [dps.PresymplecticLeapfrog(), dps.BlanesMoanRKN6()])
+@pytest.mark.parametrize(
+    "solver, adjoint",
+    [(dps.PresymplecticLeapfrog(), dfx.DirectAdjoint()), (dps.BlanesMoanRKN6(), None)],
+)
 def test_event_time_is_differentiable(solver, adjoint):
     adjoint = dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
 

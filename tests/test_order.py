@@ -20,6 +20,7 @@ from helpers import (
     SCHEMES,
     solve,
     trajectory,
+    WAYS,
 )
 
 import diffrax_presym as dps
@@ -227,7 +228,7 @@ def check_order(scheme: Scheme, system):
 
 
 @pytest.mark.parametrize("system", ["damped pendulum", "driven, quadratic T"])
-@each()
+@each(WAYS)
 def test_order_on_quadratic_kinetic_energies(scheme: Scheme, system):
     check_order(scheme, system)
 
