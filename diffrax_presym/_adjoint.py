@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
-from ._misc import as_positive
+from ._misc import as_positive, tree_sub, tree_sum
 from ._term import View, view
 
 
@@ -314,7 +314,7 @@ class _WayBack:
         gradient, y_bar = bars
         y, carry = place.bar
         return place._replace(
-            gradient=_add(place.gradient, gradient), bar=(_add(y, y_bar), carry)
+            gradient=tree_sum(place.gradient, gradient), bar=(tree_sum(y, y_bar), carry)
         )
 
     def step(self, place: _Place) -> _Place:
@@ -348,12 +348,12 @@ class _WayBack:
                     )
             gradient, info_bar = seen
             more, start_bar, end_bar = pull(info_bar)
-            gradient, bar = _add((gradient, bar), (more, end_bar))
+            gradient, bar = tree_sum((gradient, bar), (more, end_bar))
         start, more, bar = solver.pull_back(system, self.wanted, t0, t1, h, end, bar)
         more = (more, jtu.tree_map(jnp.zeros_like, self.moved[1]))
-        gradient = _add(gradient, more)
+        gradient = tree_sum(gradient, more)
         if start_bar is not None:
-            bar = _add(bar, start_bar)
+            bar = tree_sum(bar, start_bar)
         return _Place(n, t_start, start, bar, gradient, left)
 
     def unsave_between(self, i, n, t0, t1, info, seen, left):
@@ -374,7 +374,7 @@ class _WayBack:
             y, pull = jax.vjp(at, info)
             bar = jtu.tree_map(lambda x: x[saved], self.saved[i])
             more, y_bar = self.pull_saved(i, t, y, bar)
-            return times, saved, _add((gradient, info_bar), (more, *pull(y_bar)))
+            return times, saved, tree_sum((gradient, info_bar), (more, *pull(y_bar)))
 
         times, saved, seen = lax.while_loop(inside, take, (*left[i], seen))
         return seen, [*left[:i], (times, saved), *left[i + 1 :]]
@@ -419,7 +419,7 @@ class _WayBack:
             j = parts - 1 - i
             end, known = place.state, jtu.tree_map(lambda x: x[j], states)
             place = lax.while_loop(lambda p: p.n > starts(j), self.step, place)
-            miss = size(jtu.tree_map(jnp.subtract, place.state, known))
+            miss = size(tree_sub(place.state, known))
             miss = miss / jnp.maximum(size(known), size(end))
             return place._replace(state=known), jnp.maximum(worst, miss)
 
@@ -479,7 +479,3 @@ def _saved(sub: dfx.SubSaveAt, save, n) -> tuple[Array, Array]:
 def _sum_of_first(n: Array, x: Array) -> Array:
     mask = (jnp.arange(len(x)) < n).reshape(-1, *(1,) * (x.ndim - 1))
     return jnp.sum(jnp.where(mask, x, 0), axis=0)
-
-
-def _add(x: PyTree, y: PyTree) -> PyTree:
-    return jtu.tree_map(jnp.add, x, y)

@@ -52,6 +52,11 @@ def tree_add(y: PyTree, h: ArrayLike, dy: PyTree) -> PyTree:
     return jtu.tree_map(add, dy, y)
 
 
+def tree_sum(x: PyTree, y: PyTree) -> PyTree:
+    """`x + y`."""
+    return jtu.tree_map(jnp.add, x, y)
+
+
 def tree_sub(x: PyTree, y: PyTree) -> PyTree:
     """`x - y`."""
     return jtu.tree_map(jnp.subtract, x, y)

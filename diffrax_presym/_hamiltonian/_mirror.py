@@ -20,6 +20,7 @@ from .._misc import (
     scalar_fn,
     tree_dot,
     tree_sub,
+    tree_sum,
 )
 from ._damping import Scalar
 from ._kinetic import QuadraticKinetic
@@ -440,7 +441,7 @@ class MirrorMap(AbstractMirrorMap):
     def step(self, q: PyTree, p: PyTree) -> PyTree:
         if self.inverse_fn is not None:
             return _difference_step(self, q, p)
-        w = jtu.tree_map(jnp.add, self.gradient(q), p)
+        w = tree_sum(self.gradient(q), p)
         return tree_sub(self._find(w, q), q)
 
     def change(self, q: PyTree, dq: PyTree) -> PyTree:
@@ -456,12 +457,12 @@ class MirrorMap(AbstractMirrorMap):
 
 def _difference_step(mirror_map: AbstractMirrorMap, q: PyTree, p: PyTree) -> PyTree:
     image = mirror_map.gradient(q)
-    there = mirror_map.inverse(jtu.tree_map(jnp.add, image, p))
+    there = mirror_map.inverse(tree_sum(image, p))
     return tree_sub(there, mirror_map.inverse(image))
 
 
 def _difference_change(mirror_map: AbstractMirrorMap, q: PyTree, dq: PyTree) -> PyTree:
-    there = mirror_map.gradient(jtu.tree_map(jnp.add, q, dq))
+    there = mirror_map.gradient(tree_sum(q, dq))
     return tree_sub(there, mirror_map.gradient(q))
 
 

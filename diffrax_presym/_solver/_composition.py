@@ -10,6 +10,7 @@ import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import PyTree
 
+from .._misc import tree_sum
 from .._term import State, View
 from ._base import AbstractPresymplecticSolver, Clock, stage_table
 from ._copies import PresymplecticCoupled
@@ -112,7 +113,7 @@ class AbstractComposition(AbstractPresymplecticSolver[PyTree]):
             t0, t1, weight = moves
             times = clock(t0), clock(t1), weight * h
             end, more, bar = self.base.pull_back(view, wanted, *times, end, bar)
-            return (end, bar, jtu.tree_map(jnp.add, gradient, more)), None
+            return (end, bar, tree_sum(gradient, more)), None
 
         stages = stage_table(self.weights, h)
         state = (end, bar, gradient)

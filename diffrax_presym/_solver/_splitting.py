@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from .._misc import cast_to, tree_add
+from .._misc import cast_to, tree_add, tree_sum
 from .._term import State, View
 from ._base import AbstractPresymplecticSolver, Clock, pull_back, stage_table
 from ._tableaus import (
@@ -115,12 +115,12 @@ class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
             y, more, y_bar = pulled
             # Only the last force is carried on.
             none = jtu.tree_map(jnp.zeros_like, force_bar)
-            return ((y, y_bar, none), _add(gradient, more)), None
+            return ((y, y_bar, none), tree_sum(gradient, more)), None
 
         if not kick_first:
             pulled = pull_back(*drift(*(x[-1] for x in table)), view, wanted, y, y_bar)
             y, more, y_bar = pulled
-            gradient = _add(gradient, more)
+            gradient = tree_sum(gradient, more)
             force_bar = jtu.tree_map(jnp.zeros_like, y[1])
         paired = *(x[: len(kicks)] for x in table), cast_to(np.array(kicks), h)
         state = (y, y_bar, force_bar), gradient
@@ -337,10 +337,6 @@ class BlanesCasasRKN8(AbstractSplitting):
     """
 
     tableau: ClassVar[SplittingTableau] = BLANES_CASAS_RKN_8
-
-
-def _add(x: PyTree, y: PyTree) -> PyTree:
-    return jtu.tree_map(jnp.add, x, y)
 
 
 def kick(y: State, h, force: PyTree) -> State:
