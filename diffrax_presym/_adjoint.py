@@ -6,6 +6,7 @@ cotangents are pulled back through the step between them.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -327,57 +328,70 @@ class _WayBack:
         for i, sub in enumerate(self.subs):
             if sub.steps != 0:
                 place = self.unsave(place, i, place.n % sub.steps == 0)
-        gradient, bar, left = place.gradient, place.bar, place.left
-        start_bar = None
-        if self.dense is not None or any(sub.ts is not None for sub in self.subs):
-            start = solver.reverse.advance(system, t1, t0, -h, *end)[:2]
-
-            def look(moved, start, end):
-                system, _ = eqx.combine(moved, self.fixed)
-                return solver.dense_info(system, t0, t1, h, start, end)
-
-            info, pull = jax.vjp(look, self.moved, start, end)
-            info_bar = jtu.tree_map(jnp.zeros_like, info)
-            if self.dense is not None:
-                info_bar = jtu.tree_map(lambda x: x[n], self.dense)
-            seen = (gradient, info_bar)
-            for i, sub in enumerate(self.subs):
-                if sub.ts is not None:
-                    seen, left = self.unsave_between(
-                        i, n, t_start, t_end, info, seen, left
-                    )
-            gradient, info_bar = seen
-            more, start_bar, end_bar = pull(info_bar)
-            gradient, bar = tree_sum((gradient, bar), (more, end_bar))
-        start, more, bar = solver.pull_back(system, self.wanted, t0, t1, h, end, bar)
+        start_bar = jtu.tree_map(jnp.zeros_like, place.bar)
+        within = self.is_saved_within(place.left, n, t_start)
+        if within is not False:
+            # Of most steps nothing was saved between their ends, which is cheaper.
+            unsave = lambda place: self.unsave_within(place, n, t_start, t0, t1, h)
+            skip = lambda place: (place, start_bar)
+            place, start_bar = lax.cond(within, unsave, skip, place)
+        start, more, bar = solver.pull_back(
+            system, self.wanted, t0, t1, h, end, place.bar
+        )
         more = (more, jtu.tree_map(jnp.zeros_like, self.moved[1]))
-        gradient = tree_sum(gradient, more)
-        if start_bar is not None:
-            bar = tree_sum(bar, start_bar)
-        return _Place(n, t_start, start, bar, gradient, left)
+        gradient, bar = tree_sum((place.gradient, bar), (more, start_bar))
+        return _Place(n, t_start, start, bar, gradient, place.left)
 
-    def unsave_between(self, i, n, t0, t1, info, seen, left):
-        """Take back what was saved between the ends of a step."""
-        ts = self.subs[i].ts
+    def is_saved_within(self, left, n, t_start):
+        """Whether anything that is left was saved by interpolation in this step."""
+        if self.dense is not None:
+            return True
+        within = False
+        for sub, (times, _) in zip(self.subs, left, strict=True):
+            if sub.ts is not None:
+                within |= _is_within(sub.ts, times, n, t_start)
+        return within
 
-        def inside(x):
-            times, _, _ = x
-            return (times > 0) & ((n == 0) | (ts[times - 1] > t0))
+    def unsave_within(self, place: _Place, n, t_start, t0, t1, h):
+        """Take back what was saved between the ends of a step, and find the cotangents
+        of the state at its start."""
+        end, solver = place.state, self.solver
+        start = solver.reverse.advance(self.system, t1, t0, -h, *end)[:2]
 
-        def take(x):
+        def look(moved, start, end):
+            system, _ = eqx.combine(moved, self.fixed)
+            return solver.dense_info(system, t0, t1, h, start, end)
+
+        info, pull = jax.vjp(look, self.moved, start, end)
+        info_bar = jtu.tree_map(jnp.zeros_like, info)
+        if self.dense is not None:
+            info_bar = jtu.tree_map(lambda x: x[n], self.dense)
+
+        def take(i, x):
             times, saved, (gradient, info_bar) = x
             times, saved = times - 1, saved - 1
-            t = ts[times]
-            at = lambda info: self.solver.interpolation_cls(
-                t0=t0, t1=t1, **info
+            t = self.subs[i].ts[times]
+            at = lambda info: solver.interpolation_cls(
+                t0=t_start, t1=place.t, **info
             ).evaluate(t)
             y, pull = jax.vjp(at, info)
             bar = jtu.tree_map(lambda x: x[saved], self.saved[i])
             more, y_bar = self.pull_saved(i, t, y, bar)
             return times, saved, tree_sum((gradient, info_bar), (more, *pull(y_bar)))
 
-        times, saved, seen = lax.while_loop(inside, take, (*left[i], seen))
-        return seen, [*left[:i], (times, saved), *left[i + 1 :]]
+        seen, left = (place.gradient, info_bar), list(place.left)
+        for i, sub in enumerate(self.subs):
+            if sub.ts is not None:
+                inside = lambda x, ts=sub.ts: _is_within(ts, x[0], n, t_start)
+                times, saved, seen = lax.while_loop(
+                    inside, partial(take, i), (*left[i], seen)
+                )
+                left[i] = times, saved
+        gradient, info_bar = seen
+        more, start_bar, end_bar = pull(info_bar)
+        gradient, bar = tree_sum((gradient, place.bar), (more, end_bar))
+        place = place._replace(gradient=gradient, bar=bar, left=left)
+        return place, start_bar
 
     def back_to_start(self, place: _Place, parts, most: int) -> tuple[_Place, Array]:
         """Back to the start in a number of parts, each from a state that is known.
@@ -457,6 +471,11 @@ def _materialise(like: PyTree, bar: PyTree) -> PyTree:
     """Cotangents of what can have them, also where there are none."""
     like = eqx.filter(like, eqx.is_inexact_array)
     return jtu.tree_map(lambda x, b: jnp.zeros_like(x) if b is None else b, like, bar)
+
+
+def _is_within(ts, times, n, t_start):
+    """Whether the last of so many `ts` is in the step that begins here."""
+    return (times > 0) & ((n == 0) | (ts[times - 1] > t_start))
 
 
 def _largest(x: Array) -> Array:
