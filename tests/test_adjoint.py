@@ -8,10 +8,12 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+import optax
 import pytest
 from helpers import assert_close, each, IMPLICIT, mixed_energy, Scheme, SCHEMES
 
 import diffrax_presym as dps
+from diffrax_presym._adjoint import _clock
 
 
 REVERSIBLE = dps.ReversibleAdjoint()
@@ -89,7 +91,7 @@ def test_gradients_are_those_of_the_computed_numbers(scheme: Scheme):
     check(solver=scheme.solver)
 
 
-@each(named(IMPLICIT, "euler_B"))
+@each(named(IMPLICIT, "euler_B", "midpoint"))
 def test_implicit_schemes_reverse_too(scheme: Scheme):
     check(solver=scheme.solver, system=nonseparable, t1=0.5, tolerance=1e-9)
 
@@ -101,16 +103,19 @@ def test_implicit_schemes_reverse_too(scheme: Scheme):
         dps.BlanesMoan4(),
         dps.Substeps(dps.PresymplecticEuler(), 3),
         dps.Splitting(dps.SplittingTableau(1, True, False, (0.3, 1.0, 0.7))),
+        dps.PresymplecticCoupled(4),
+        dps.Checked(LEAPFROG),
+        dps.Compensated(dps.BlanesMoanRKN4(), 0.1),
     ],
     ids=lambda solver: type(solver).__name__,
 )
-def test_splittings_and_asymmetric_compositions(solver):
+def test_splittings_wrappers_and_asymmetric_compositions(solver):
     check(solver=solver)
 
 
 def energy(t, y, args):
     q, p = y
-    return {"energy": jnp.sum(p**2) / 2 + pendulum(t, q, args), "count": q.size}
+    return jnp.sum(p**2) / 2 + pendulum(t, q, args)
 
 
 TS = jnp.array([0.0, 0.05, 0.05, 0.3, 0.71, 1.0])
@@ -124,9 +129,7 @@ TS = jnp.array([0.0, 0.05, 0.05, 0.3, 0.71, 1.0])
         dict(dense=True, t1=True, solver_state=True),
         dict(
             subs=[
-                dfx.SubSaveAt(
-                    ts=TS, fn=lambda t, y, args: energy(t, y, args)["energy"]
-                ),
+                dfx.SubSaveAt(ts=TS, fn=energy),
                 dict(steps=dfx.SubSaveAt(steps=4, t1=True)),
             ]
         ),
@@ -148,6 +151,139 @@ def test_step_to_and_splitting_dense_output():
     ts = jnp.array([0.0, 0.1, 0.3, 0.35, 1.0])
     kwargs: dict[str, Any] = dict(dt0=None, stepsize_controller=dfx.StepTo(ts))
     check(saveat=dfx.SaveAt(ts=TS), solver=dps.BlanesMoanRKN6(), **kwargs)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64], ids=lambda x: x.__name__)
+@pytest.mark.parametrize(
+    "t0, t1, dt0",
+    [(0.0, 1.0, 0.1), (0.3, 7.9, 0.3), (-2.0, 5.0, 10.0), (1e4, 1e4 + 0.1, 0.01)],
+)
+def test_steps_are_found_again_to_rounding(t0, t1, dt0, dtype):
+    t0, t1, dt0 = (jnp.asarray(t, dtype) for t in (t0, t1, dt0))
+    y0 = (jnp.ones(1, dtype), jnp.zeros(1, dtype))
+    term = dps.HamiltonianTerm(separable(GAMMA.astype(dtype)))
+    saveat = dfx.SaveAt(t0=True, steps=True)
+    stiffness = STIFFNESS.astype(dtype)
+    sol = dfx.diffeqsolve(
+        term, LEAPFROG, t0, t1, dt0, y0, stiffness, saveat=saveat, max_steps=32
+    )
+    n = int(sol.stats["num_steps"])
+    time = _clock(dfx.ConstantStepSize(), t0, t1, dt0)
+    with jax.numpy_dtype_promotion("standard"):  # as within `diffeqsolve`
+        times = jax.vmap(time)(jnp.arange(n + 1))
+    ulp = jnp.finfo(dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+    assert sol.ts is not None and n > 0
+    assert jnp.all(jnp.abs(sol.ts[: n + 1] - times) <= 2 * ulp)
+    assert sol.ts[0] == times[0] and sol.ts[n] == times[n]
+
+
+def test_a_solve_of_no_length():
+    saveat = dfx.SaveAt(t0=True, t1=True, ts=jnp.array([0.5, 0.5]))
+    ours = value_and_gradient(INPUTS, REVERSIBLE, dict(t0=0.5, t1=0.5, saveat=saveat))
+    exact = jax.value_and_grad(lambda y: add_up([jnp.stack([x] * 4) for x in y]))(Y0)
+    assert_close(jtu.tree_leaves(ours)[:3], jtu.tree_leaves(exact), 1e-15)
+
+
+def test_gradients_of_what_a_saved_function_closes_over():
+    def gradient(adjoint):
+        def loss(scale):
+            fn = lambda t, y, args: scale * y[0] ** 2 * t
+            return add_up(solve(INPUTS, adjoint, saveat=dfx.SaveAt(ts=TS, fn=fn)).ys)
+
+        return jax.grad(loss)(jnp.asarray(np.float64(0.7)))
+
+    assert_close(gradient(REVERSIBLE), gradient(CHECKPOINTED), 1e-13)
+
+
+@pytest.mark.parametrize("i", range(3))
+def test_saved_values_by_central_differences(i):
+    """Of one number of each kind that can be saved, along one direction."""
+    saveat = dfx.SaveAt(subs=[dfx.SubSaveAt(ts=TS, steps=2), dfx.SubSaveAt(t1=True)])
+    saveat = eqx.tree_at(lambda x: x.subs[1].fn, saveat, energy)
+    picks = [
+        lambda ys: ys[0][0][3, 0],  # between two steps
+        lambda ys: ys[0][1][5, 1],  # at a step
+        lambda ys: ys[1][0],
+    ]
+
+    @jax.jit
+    def value(e):
+        inputs = jtu.tree_map(lambda x: x + e * jnp.cos(x), INPUTS)
+        return picks[i](solve(inputs, REVERSIBLE, saveat=saveat).ys)
+
+    e, zero = 1e-5, jnp.zeros(())
+    assert_close(jax.grad(value)(zero), (value(e) - value(-e)) / (2 * e), 1e-9)
+
+
+@pytest.mark.parametrize("made_jump", [None, True])
+def test_a_solve_continued_from_another(made_jump):
+    """What a solver carries comes from the first half; or is made anew after a jump."""
+
+    def gradient(adjoint):
+        def loss(y0):
+            first = solve(
+                (y0, GAMMA, STIFFNESS),
+                adjoint,
+                saveat=dfx.SaveAt(t1=True, solver_state=True),
+            )
+            y = jtu.tree_map(lambda x: (1.5 if made_jump else 1) * x[-1], first.ys)
+            second = solve(
+                (y, GAMMA, STIFFNESS),
+                adjoint,
+                t0=1.0,
+                t1=2.0,
+                solver_state=first.solver_state,
+                made_jump=None if made_jump is None else jnp.asarray(made_jump),
+            )
+            return add_up(second.ys)
+
+        return jax.jit(jax.grad(loss))(Y0)
+
+    assert_close(gradient(REVERSIBLE), gradient(CHECKPOINTED), 1e-12)
+
+
+def test_a_stale_solver_state_is_an_error():
+    def loss(force):
+        return add_up(solve(INPUTS, REVERSIBLE, solver_state=force).ys)
+
+    with pytest.raises(Exception, match="with an error beyond"):
+        jax.block_until_ready(jax.grad(loss)(Y0[0]))
+
+
+def test_an_optimiser_of_optax():
+    """Friction and stiffness are found again, by a training loop as users write it."""
+
+    class Model(eqx.Module):
+        gamma: jax.Array
+        stiffness: jax.Array
+
+        def __call__(self):
+            inputs = (Y0, self.gamma, self.stiffness)
+            return solve(inputs, REVERSIBLE, saveat=dfx.SaveAt(ts=TS)).ys
+
+    data = Model(GAMMA, STIFFNESS)()
+    optimiser = optax.adam(0.05)
+
+    @eqx.filter_value_and_grad
+    def loss(model):
+        errors = jtu.tree_map(lambda x, y: jnp.sum((x - y) ** 2), model(), data)
+        return sum(jtu.tree_leaves(errors))
+
+    @eqx.filter_jit
+    @jax.numpy_dtype_promotion("standard")  # Optax needs it.
+    def update(model, state):
+        value, gradient = loss(model)
+        change, state = optimiser.update(gradient, state)
+        return eqx.apply_updates(model, change), state, value
+
+    model = Model(jnp.asarray(np.float64(0.1)), jnp.asarray(np.float64(1.0)))
+    state = optimiser.init(eqx.filter(model, eqx.is_array))
+    values = []
+    for _ in range(200):
+        model, state, value = update(model, state)
+        values.append(float(value))
+    assert values[-1] < 1e-6 * values[0]
+    assert_close((model.gamma, model.stiffness), (GAMMA, STIFFNESS), 1e-2)
 
 
 def test_without_max_steps():
