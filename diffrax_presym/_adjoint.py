@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
-from ._misc import as_positive, tree_sub, tree_sum
+from ._misc import as_positive, opened, tree_sub, tree_sum
 from ._term import View, view
 
 
@@ -32,10 +32,11 @@ class ReversibleAdjoint(dfx.AbstractAdjoint):
 
     For every solver of this package that can be reversed, with
     `diffrax.ConstantStepSize` or `diffrax.StepTo`, with any `SaveAt`, and with respect
-    to `y0`, `args`, all that is inside the term and all that a `SaveAt(fn=...)` closes
-    over. Everything else is refused, in favour of `diffrax.RecursiveCheckpointAdjoint`:
-    events, adaptive steps, derivatives with respect to times. Second derivatives are
-    had by forward mode over reverse mode, `jax.jvp` of `jax.grad`.
+    to `y0`, `args`, all that is inside the term, and all that a function of these or of
+    `SaveAt(fn=...)` closes over. Everything else is refused, in favour of
+    `diffrax.RecursiveCheckpointAdjoint`: events, adaptive steps, derivatives with
+    respect to times. Second derivatives are had by forward mode over reverse mode,
+    `jax.jvp` of `jax.grad`.
 
     Damping loses information: on the way back rounding grows by $e^{\eta(t_1) -
     \eta(t_0)}$. Where that is too much, or the start is missed on arrival there, the
@@ -79,9 +80,7 @@ class ReversibleAdjoint(dfx.AbstractAdjoint):
             # What is carried is stale then, and is made anew before the first step.
             restart = lambda: solver.start(system, system.time(rest["t0"]), y)
             carry = lax.cond(init_state.made_jump, restart, lambda: carry)
-        # What a function to be saved closes over is differentiated like all else.
-        convert = lambda fn: eqx.filter_closure_convert(fn, rest["t0"], y, args)
-        fns = [convert(fn) for fn in _fns(saveat)]
+        fns = _fns(saveat)
         rest |= dict(
             solver=solver,
             terms=eqx.tree_at(_hamiltonian, terms, None),
@@ -90,7 +89,9 @@ class ReversibleAdjoint(dfx.AbstractAdjoint):
                 _start, init_state, (None, None, False), is_leaf=_is_none
             ),
         )
-        out = _solve(_Inputs((y, carry), (system, fns), rest), self)
+        # What functions close over is differentiated like all else.
+        parameters = opened((system, fns))
+        out = _solve(_Inputs((y, carry), parameters, rest), self)
         # To JAX all that comes out of a custom rule has a derivative, integers too.
         out, counts = eqx.partition(out, eqx.is_inexact_array)
         return eqx.combine(out, eqxi.nondifferentiable_backward(counts))

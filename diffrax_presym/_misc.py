@@ -1,3 +1,7 @@
+import functools
+from types import CellType, FunctionType
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -147,3 +151,45 @@ def match(value: PyTree, like: PyTree, name: str, like_name: str) -> PyTree:
             ) from e
 
     return jtu.tree_map(leaf, value, like)
+
+
+class _Opened(eqx.Module):
+    """A Python function, and what it closes over as leaves of a pytree."""
+
+    fn: Any = eqx.field(static=True)
+    cells: list
+    defaults: tuple | None
+    keywords: dict | None
+
+    def __call__(self, *args, **kwargs):
+        cells = tuple(map(CellType, self.cells))
+        code, names = self.fn.__code__, self.fn.__globals__
+        fn = FunctionType(code, names, self.fn.__name__, self.defaults, cells)
+        fn.__kwdefaults__ = self.keywords
+        return fn(*args, **kwargs)
+
+
+def opened(tree: PyTree) -> PyTree:
+    """The same, but every array that a function in it closes over is a leaf of it.
+
+    A custom rule for derivatives needs that, and knows of no function what it will be
+    called with, which is what `equinox.filter_closure_convert` would ask for.
+    """
+    return jtu.tree_map(lambda x: _open(x, ()), tree)
+
+
+def _open(x, within: tuple):
+    if isinstance(x, functools.partial):
+        fn, first, known = x.func, x.args, x.keywords
+        x = lambda *args, **kwargs: fn(*first, *args, **(known | kwargs))
+    # A function that closes over itself is left as it is: there is no end to it.
+    if not isinstance(x, FunctionType) or x in within:
+        return x
+    try:
+        cells = [cell.cell_contents for cell in x.__closure__ or ()]
+    except ValueError:  # not yet filled
+        return x
+    inside = cells, x.__defaults__, x.__kwdefaults__
+    inside = jtu.tree_map(lambda leaf: _open(leaf, (*within, x)), inside)
+    # A function is equal to itself alone, so it stays itself where it can.
+    return _Opened(x, *inside) if any(map(eqx.is_array, jtu.tree_leaves(inside))) else x

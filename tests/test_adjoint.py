@@ -1,5 +1,6 @@
 """Gradients by running the scheme backwards, against all other ways to get them."""
 
+from functools import partial
 from typing import Any
 
 import diffrax as dfx
@@ -193,6 +194,47 @@ def test_gradients_of_what_a_saved_function_closes_over():
         return jax.grad(loss)(jnp.asarray(np.float64(0.7)))
 
     assert_close(gradient(REVERSIBLE), gradient(CHECKPOINTED), 1e-13)
+
+
+class Bowl(eqx.Module):
+    depth: jax.Array
+
+    def __call__(self, q):
+        return self.depth * q**2
+
+
+def test_gradients_of_what_functions_of_the_term_close_over():
+    """However deep: in functions of functions, of defaults, of modules, of `args`."""
+
+    def gradient(adjoint):
+        def loss(x):
+            a, b, c, d, e = x
+            bowl = Bowl(a)
+            inner = lambda q: jnp.sum(jax.vmap(bowl)(q))
+
+            def potential(t, q, args, *, scale=b):
+                return scale * inner(q) + args(q)
+
+            hamiltonian = dps.ConformalHamiltonian(
+                dps.QuadraticKinetic(), partial(potential, scale=d), lambda t: c * t
+            )
+            sol = dfx.diffeqsolve(
+                dps.HamiltonianTerm(hamiltonian),
+                LEAPFROG,
+                0.0,
+                1.0,
+                0.1,
+                Y0,
+                lambda q: e * jnp.sum(q**4),
+                adjoint=adjoint,
+            )
+            return add_up(sol.ys)
+
+        return jax.jit(jax.grad(loss))(jnp.array([1.0, 2.0, 0.3, 0.5, 0.1]))
+
+    ours = gradient(REVERSIBLE)
+    assert_close(ours, gradient(dfx.RecursiveCheckpointAdjoint()), 1e-13)
+    assert jnp.all((ours != 0) == jnp.array([True, False, True, True, True]))
 
 
 @pytest.mark.parametrize("i", range(3))
