@@ -8,6 +8,7 @@ import argparse
 import pathlib
 import statistics
 import time
+from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
@@ -126,7 +127,7 @@ def overflow(quick):
                 if name == "frame":
                     system = damped(harmonic, dps.ConstantDamping(gamma))
                 elif name == "canonical":
-                    system = canonical_form(gamma)
+                    system = canonical_form(harmonic, gamma)
                 else:
                     system = dps.DissipativeHamiltonian(
                         QUADRATIC,
@@ -146,11 +147,12 @@ def overflow(quick):
     )
 
 
-def canonical_form(gamma):
+def canonical_form(potential, gamma):
     """The same system in canonical momenta, the naive way: P grows like exp(eta)."""
+    gradient = jax.grad(potential, argnums=1)
     return dps.VectorField(
         lambda t, p, args: jnp.exp(-gamma * t) * p,
-        lambda t, q, args: -jnp.exp(gamma * t) * q,
+        lambda t, q, args: -jnp.exp(gamma * t) * gradient(t, q, args),
     )
 
 
@@ -359,19 +361,27 @@ def encounters(quick):
     )
 
 
+def weighted(t, q, args):
+    return jnp.sum(args * q**2) / 2
+
+
 def eight_energy(t, q, args):
     return -jnp.sum(1 / dps.pair_distances(q))
 
 
-def figure_eight(quick):
-    """Three bodies on one curve, and what friction makes of it."""
+PERIOD = 6.32591398
+
+
+def eight_start():
     q1 = np.array([0.97000436, -0.24308753])
     v3 = np.array([-0.93240737, -0.86473146])
-    y0 = (
-        jnp.array([q1, -q1, [0.0, 0.0]]),
-        jnp.array([-v3 / 2, -v3 / 2, v3]),
-    )
-    period, rows = 6.32591398, []
+    q0 = jnp.array([q1, -q1, [0.0, 0.0]])
+    return q0, jnp.array([-v3 / 2, -v3 / 2, v3])
+
+
+def figure_eight(quick):
+    """Three bodies on one curve, and what friction makes of it."""
+    y0, period, rows = eight_start(), PERIOD, []
     for gamma in (0.0, 1e-3):
         system = damped(eight_energy, dps.ConstantDamping(gamma))
         t1 = (10 if quick else 50) * period
@@ -547,11 +557,7 @@ def conditioning(quick):
         (f"dimension {size:.0e}", np.linspace(0.0, 1.0, size), None),
     ):
         stiffness = jnp.asarray(stiffness)
-
-        def potential(t, q, args):
-            return jnp.sum(args * q**2) / 2
-
-        system = conservative(potential, None if mass is None else jnp.asarray(mass))
+        system = conservative(weighted, None if mass is None else jnp.asarray(mass))
         y0 = (jnp.ones(stiffness.size), jnp.zeros(stiffness.size))
         before = float(system.energy(ZERO, *y0, stiffness))
         cells = []
@@ -599,6 +605,88 @@ def broken(quick):
     table(
         "9. broken input: result, number of steps",
         ("case", "as it is", "Checked", "Tsit5"),
+        rows,
+    )
+
+
+# Each with its force evaluations per step.
+EVERYONE = {
+    "PresymplecticEuler": (dps.PresymplecticEuler(), 1),
+    "PresymplecticLeapfrog": (LEAPFROG, 1),
+    "Strang": (dps.Strang(), 1),
+    "PresymplecticYoshida4": (dps.PresymplecticYoshida4(), 3),
+    "Suzuki4": (dps.Suzuki4(), 5),
+    "BlanesMoan4": (dps.BlanesMoan4(), 6),
+    "BlanesMoanRKN4": (RKN4, 6),
+    "SofroniouSpaletta6": (dps.SofroniouSpaletta6(), 13),
+    "BlanesMoan6": (dps.BlanesMoan6(), 10),
+    "BlanesMoanRKN6": (RKN6, 14),
+    "SofroniouSpaletta8": (dps.SofroniouSpaletta8(), 21),
+    "BlanesCasasRKN8": (dps.BlanesCasasRKN8(), 19),
+    "SofroniouSpaletta10": (dps.SofroniouSpaletta10(), 35),
+    "PresymplecticTao": (dps.PresymplecticTao(), 3),
+    "PresymplecticCoupled(4)": (dps.PresymplecticCoupled(4), 11),
+    "PresymplecticCoupled(6)": (dps.PresymplecticCoupled(6), 27),
+    "leapfrog, canonical": (LEAPFROG, 1),
+    "Tsit5, equal steps": (dfx.Tsit5(), 6),
+    "Dopri8, equal steps": (dfx.Dopri8(), 13),
+}
+
+
+def every_scheme(quick):
+    """All schemes in all cases where one number tells, by as many evaluations."""
+    e, gamma = 0.9, 20.0
+    slow, fast = np.roots([1.0, gamma, 1.0])[::-1]
+    settled = (slow * np.exp(fast * 50) - fast * np.exp(slow * 50)) / (slow - fast)
+    stiffness = jnp.logspace(-8, 0, 50)
+    one = jnp.ones(1)
+    # Potential, friction, start, `args`, end, and evaluations until then.
+    cases = {
+        "overflow": (harmonic, gamma, (one, 0 * one), None, 50.0, 20_000),
+        "long": (pendulum, None, (2 * one, 0 * one), None, 1e4, 200_000),
+        "e = 0.9": (
+            newton,
+            None,
+            (jnp.array([1 + e, 0.0]), jnp.array([0.0, ((1 - e) / (1 + e)) ** 0.5])),
+            None,
+            20 * np.pi + 3,
+            40_000,
+        ),
+        "eight": (eight_energy, None, eight_start(), None, 10.3 * PERIOD, 6_000),
+        "|q|": (absolute, None, (one, 0 * one), None, 100.0, 10_000),
+        "1e8": (
+            weighted,
+            None,
+            (jnp.ones(50), jnp.zeros(50)),
+            stiffness,
+            1000.0,
+            10_000,
+        ),
+    }
+    rows = []
+    system: Any
+    for name, (solver, cost) in EVERYONE.items():
+        cells = []
+        for potential, friction, y0, args, t1, most in cases.values():
+            if friction is None:
+                system = conservative(potential)
+            elif "canonical" in name:
+                system = canonical_form(potential, friction)
+            else:
+                system = damped(potential, dps.ConstantDamping(friction))
+            steps = max(1, round(most / cost) // (10 if quick else 1))
+            _, y = end(system, solver, 0.0, t1, t1 / steps, y0, args)
+            q, p = map(jnp.asarray, y)
+            if friction is None:
+                energy = lambda y, s=system, a=args: float(s.energy(ZERO, *y, a))
+                cells.append(number(abs(energy((q, p)) / energy(y0) - 1)))
+            else:
+                cells.append(number(abs(q[0] / settled - 1)))
+        rows.append((name, *cells))
+    table(
+        "Every scheme by as many force evaluations: relative error of q in the first "
+        "case, of the energy in the others",
+        ("scheme", *cases),
         rows,
     )
 
@@ -714,6 +802,7 @@ def main():
         non_smooth,
         conditioning,
         broken,
+        every_scheme,
         prices,
     )
     out = {}
