@@ -40,11 +40,12 @@ TRUTH = {
     "hardening 2": 0.5,
     "hardening 3": 2.0,
 }
-# Of the parameters all is said in logarithms, so that they stay positive.
+# Fitted are logarithms, so that parameters stay positive.
 LOGS = np.log(list(TRUTH.values()))
 GUESS = np.log([1.0, 1.0, 0.1, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+# Of the time of the data: how much is fitted, first and last.
 PARTS = (0.1, 0.3, 1.0)
-# Measured is at some of these times, and predicted at all.
+# Predicted is at all of these times, and measured at some.
 GRID = np.linspace(0, 3 * DURATION, 801)
 
 
@@ -165,7 +166,7 @@ def main():
     ts = GRID[seen]
     measure = lambda noise: truth[seen] + noise * rng.standard_normal(truth[seen].shape)
 
-    print("Of the noise: left by a fit to all at once, and by one on growing horizons")
+    print("What fits leave, in units of the noise: to all at once, on growing horizons")
     fits = {}
     for noise in noises:
         data = measure(noise)
@@ -178,7 +179,8 @@ def main():
         print(f"{noise:<12}" + "".join(f"{x / noise:10.3f}" for x in left))
 
     print("\nEstimates, their standard errors, and by how many of these they are off")
-    print(f"{'':12}{'truth':>8}" + "".join(f"{x:>20}" + 8 * " " for x in noises))
+    heads = "".join(f"{f'noise {x}':>12}{'error':>8}{'off by':>8}" for x in noises)
+    print(f"{'':12}{'truth':>8}{heads}")
     for i, (name, true) in enumerate(TRUTH.items()):
         print(f"{name:12}{true:8.3f}", end="")
         for _, logs, _, error, *_ in fits.values():
@@ -186,14 +188,13 @@ def main():
             print(f"{value:12.4f}{value * error[i]:8.4f}{off:8.1f}", end="")
         print()
 
-    noise = noises[0]
-    off = []
+    noise, off = noises[0], []
     for _ in range(repeats):
         data = measure(noise)
         logs = fit(fits[noise][1], starts, ts, data, PARTS[-1])
         off.append((logs - LOGS) / judge(logs, starts, seen, data)[1])
     off = np.abs(off)
-    print(f"\nMeasured {repeats} times more, with noise {noise}: off by", end=" ")
+    print(f"\nMeasured anew {repeats} times, with noise {noise}: off by", end=" ")
     print(f"{np.sqrt(np.mean(off**2)):.2f} standard errors in the mean square,")
     print(f"{np.mean(off < 1):.0%} within one, {np.mean(off < 2):.0%} within two")
     picture(options.output, fits, truth, seen)
