@@ -20,7 +20,7 @@ BENCHMARKS := against_loop compile_time schemes work_precision batches nonsepara
 export MPLBACKEND ?= Agg
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test oldest lint format docs serve examples paper bench clean
+.PHONY: help demo test oldest lint format docs serve tutorials examples paper bench clean
 # The targets share one environment, so never two at a time.
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
@@ -56,6 +56,9 @@ docs: $(VENV)/.with-docs  ## Build the documentation into site/
 
 serve: $(VENV)/.with-docs  ## Serve the documentation while you edit it
 	@$(BIN)/mkdocs serve
+
+tutorials: $(VENV)/.with-examples  ## Run the tutorials, and draw their pictures
+	@$(BIN)/python docs/_tutorials.py
 
 examples: $(VENV)/.with-examples  ## Run every example, quickly
 	@set -e; for script in $(EXAMPLES); do \

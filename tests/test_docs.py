@@ -3,7 +3,7 @@
 import inspect
 import pathlib
 import re
-import textwrap
+import runpy
 
 import diffrax as dfx
 import equinox as eqx
@@ -20,6 +20,9 @@ import diffrax_presym as dps
 
 ROOT = pathlib.Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
+SCRIPT = runpy.run_path(str(ROOT / "docs" / "_tutorials.py"))
+FENCE, python_blocks = SCRIPT["FENCE"], SCRIPT["python_blocks"]
 PUBLIC = {
     name: value
     for name, value in vars(dps).items()
@@ -31,18 +34,9 @@ PUBLIC |= {
     if not name.startswith("_")
     and getattr(value, "__module__", "").endswith(".diagnostics")
 }
-FENCE = re.compile(
-    r"^(?P<indent> *)```(?P<language>[^\n`]*)\n(?P<code>.*?)^(?P=indent)```$",
-    re.DOTALL | re.MULTILINE,
-)
 REFERENCE = re.compile(
     r"\[`?(diffrax_presym\.[\w.]+)`?\]\[|\]\[(diffrax_presym\.[\w.]+)\]"
 )
-
-
-def python_blocks(text):
-    found = FENCE.finditer(text)
-    return [textwrap.dedent(x["code"]) for x in found if x["language"] == "python"]
 
 
 def docstrings(value):
@@ -97,6 +91,16 @@ def test_docstring_runs(name, as_user):
 def test_blocks_say_their_language(page):
     languages = {x["language"] for x in FENCE.finditer(page.read_text())}
     assert languages <= {"bash", "bibtex", "python", "sh", "text"}
+
+
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda x: x.stem)
+def test_tutorials_draw_the_pictures_they_show(page):
+    text = page.read_text()
+    shown = re.findall(r"!\[[^\]]+\]\(\.\./img/([^)]+)\)", text)
+    code = "\n".join(python_blocks(text))
+    assert shown == re.findall(r"savefig\(\"([^\"]+)\"", code)
+    assert shown == [f"tutorial_{page.stem}.png"]
+    assert all((ROOT / "docs" / "img" / name).is_file() for name in shown)
 
 
 def test_every_public_name_is_in_the_api():
