@@ -12,6 +12,7 @@ import numpy as np
 import optax
 import pytest
 from helpers import assert_close, each, IMPLICIT, mixed_energy, Scheme, SCHEMES
+from jax.flatten_util import ravel_pytree
 
 import diffrax_presym as dps
 from diffrax_presym._adjoint import _clock
@@ -65,18 +66,32 @@ def solve(inputs, adjoint, solver: Any = LEAPFROG, system=separable, **kwargs):
     )
 
 
-@eqx.filter_jit
-@eqx.filter_value_and_grad
-def value_and_gradient(inputs, adjoint, kwargs):
+def value(inputs, adjoint, kwargs):
     sol = solve(inputs, adjoint, **kwargs)
     # Of what is not asked for, a solution has `None`.
     dense = None if sol.interpolation is None else sol.evaluate(0.37 * sol.t1)
     return add_up((sol.ys, sol.solver_state, dense))
 
 
-def check(inputs=INPUTS, adjoint=REVERSIBLE, tolerance=1e-12, **kwargs):
-    ours = value_and_gradient(inputs, adjoint, kwargs)
-    assert_close(ours, value_and_gradient(inputs, CHECKPOINTED, kwargs), tolerance)
+value_and_gradient = eqx.filter_jit(eqx.filter_value_and_grad(value))
+
+
+@eqx.filter_jit
+def by_forward_mode(inputs, kwargs):
+    """The same by another way, which compiles in half the time of reverse mode."""
+    numbers, unravel = ravel_pytree(inputs)
+
+    def of_numbers(numbers):
+        out = value(unravel(numbers), dfx.ForwardMode(), kwargs)
+        return out, out
+
+    gradient, out = jax.jacfwd(of_numbers, has_aux=True)(numbers)
+    return out, unravel(gradient)
+
+
+def check(tolerance=1e-12, **kwargs):
+    ours = value_and_gradient(INPUTS, REVERSIBLE, kwargs)
+    assert_close(ours, by_forward_mode(INPUTS, kwargs), tolerance)
     assert all(np.all(x != 0) for x in jtu.tree_leaves(ours[1]))
 
 
@@ -92,7 +107,7 @@ def test_gradients_are_those_of_the_computed_numbers(scheme: Scheme):
     check(solver=scheme.solver)
 
 
-@each(named(IMPLICIT, "euler_B", "midpoint"))
+@each(named(IMPLICIT, "euler_B"))
 def test_implicit_schemes_reverse_too(scheme: Scheme):
     check(solver=scheme.solver, system=nonseparable, t1=0.5, tolerance=1e-9)
 
@@ -100,13 +115,10 @@ def test_implicit_schemes_reverse_too(scheme: Scheme):
 @pytest.mark.parametrize(
     "solver",
     [
-        dps.BlanesMoanRKN4(),
-        dps.BlanesMoan4(),
         dps.Substeps(dps.PresymplecticEuler(), 3),
         dps.Splitting(dps.SplittingTableau(1, True, False, (0.3, 1.0, 0.7))),
         dps.PresymplecticCoupled(4),
-        dps.Checked(LEAPFROG),
-        dps.Compensated(dps.BlanesMoanRKN4(), 0.1),
+        dps.Checked(dps.Compensated(dps.BlanesMoanRKN4(), 0.1)),
     ],
     ids=lambda solver: type(solver).__name__,
 )
@@ -237,24 +249,24 @@ def test_gradients_of_what_functions_of_the_term_close_over():
     assert jnp.all((ours != 0) == jnp.array([True, False, True, True, True]))
 
 
-@pytest.mark.parametrize("i", range(3))
-def test_saved_values_by_central_differences(i):
+def test_saved_values_by_central_differences():
     """Of one number of each kind that can be saved, along one direction."""
     saveat = dfx.SaveAt(subs=[dfx.SubSaveAt(ts=TS, steps=2), dfx.SubSaveAt(t1=True)])
     saveat = eqx.tree_at(lambda x: x.subs[1].fn, saveat, energy)
-    picks = [
-        lambda ys: ys[0][0][3, 0],  # between two steps
-        lambda ys: ys[0][1][5, 1],  # at a step
-        lambda ys: ys[1][0],
-    ]
 
     @jax.jit
-    def value(e):
+    def saved(e, i):
         inputs = jtu.tree_map(lambda x: x + e * jnp.cos(x), INPUTS)
-        return picks[i](solve(inputs, REVERSIBLE, saveat=saveat).ys)
+        ys: Any = solve(inputs, REVERSIBLE, saveat=saveat).ys
+        (q, p), energies = ys
+        between, at_a_step, by_function = q[3, 0], p[5, 1], energies[0]
+        return jnp.stack([between, at_a_step, by_function])[i]
 
-    e, zero = 1e-5, jnp.zeros(())
-    assert_close(jax.grad(value)(zero), (value(e) - value(-e)) / (2 * e), 1e-9)
+    slope = jax.jit(jax.grad(saved))
+    e, zero = jnp.asarray(np.float64(1e-5)), jnp.zeros(())
+    for i in jnp.arange(3):
+        difference = (saved(e, i) - saved(-e, i)) / (2 * e)
+        assert_close(slope(zero, i), difference, 1e-9)
 
 
 @pytest.mark.parametrize("made_jump", [None, True])
@@ -337,13 +349,11 @@ def undriven(t, q, args):
     return jnp.sum(1 - jnp.cos(q))
 
 
-def strongly_damped(adjoint, eta, dtype: Any = jnp.float64):
-    """The gradient of a solve that damps by `eta` e-folds, a trap for reversal."""
-
-    @jax.jit
-    @jax.grad
-    def gradient(inputs):
+@eqx.filter_jit
+def damping_gradient(adjoint, inputs):
+    def loss(inputs):
         q0, gamma = inputs
+        dtype = q0.dtype
         term = dps.HamiltonianTerm(
             dps.ConformalHamiltonian(
                 dps.QuadraticKinetic(), undriven, dps.ConstantDamping(gamma)
@@ -357,7 +367,13 @@ def strongly_damped(adjoint, eta, dtype: Any = jnp.float64):
         sol = dfx.diffeqsolve(term, LEAPFROG, t0, t1, dt0, y0, **options)
         return sum(jnp.sum(y**2) for y in jtu.tree_leaves(sol.ys))
 
-    return gradient((jnp.array([1.0, 0.3], dtype), jnp.asarray(eta / 100, dtype)))
+    return jax.grad(loss)(inputs)
+
+
+def strongly_damped(adjoint, eta, dtype: Any = jnp.float64):
+    """The gradient of a solve that damps by `eta` e-folds, a trap for reversal."""
+    inputs = jnp.array([1.0, 0.3], dtype), jnp.asarray(eta / 100, dtype)
+    return damping_gradient(adjoint, inputs)
 
 
 @pytest.mark.parametrize("eta", [10.0, 100.0, 1000.0])
