@@ -5,11 +5,10 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact, PyTree, Real
 
-from .._misc import as_parameter, cast_to, tree_add, tree_scale
+from .._misc import as_parameter, cast_to, tree_add
 
 
 Time = Real[Array, ""]
@@ -216,17 +215,16 @@ def _one_number(damping: Scalar) -> Scalar:
     return damping
 
 
-def quadrature(fn: Callable, h: Time, order: int) -> PyTree:
-    """The integral of a function of time, a pytree, from 0 to `h`.
-
-    By Gauss and Legendre, of at least the given order.
-    """
+def gauss_legendre(h: Time, order: int) -> tuple[Array, Array]:
+    """Nodes and weights of a quadrature from 0 to `h`, of at least the given order."""
     nodes, weights = np.polynomial.legendre.leggauss((order + 1) // 2)
-    terms = [
-        tree_scale(weight / 2 * h, fn((1 + node) / 2 * h))
-        for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True)
-    ]
-    return jtu.tree_map(lambda *x: sum(x[1:], x[0]), *terms)
+    return cast_to((1 + nodes) / 2, h) * h, cast_to(weights / 2, h) * h
+
+
+def quadrature(fn: Callable, h: Time, order: int) -> Scalar:
+    """The integral of a number that depends on time, from 0 to `h`."""
+    nodes, weights = gauss_legendre(h, order)
+    return jnp.sum(weights * cast_to(jax.vmap(fn)(nodes), h))
 
 
 # exp(x) - 1 and its ratio to x, to rounding and with their derivatives, through zero.

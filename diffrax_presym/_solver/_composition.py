@@ -4,13 +4,13 @@ from typing import ClassVar, Literal, TYPE_CHECKING
 
 import diffrax as dfx
 import equinox as eqx
-import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import PyTree
 
 from .._misc import tree_sum
+from .._scan import scan_stages
 from .._term import State, View
 from ._base import AbstractPresymplecticSolver, Clock, stage_table
 from ._copies import PresymplecticCoupled
@@ -96,7 +96,7 @@ class AbstractComposition(AbstractPresymplecticSolver[PyTree]):
             return (y, carry), result
 
         stages = stage_table(self.weights, h)
-        (y, carry), results = lax.scan(stage, (y, carry), stages)
+        (y, carry), results = scan_stages(stage, (y, carry), stages)
         if results is not None:
             # The first stage to fail, or any if none did.
             failed = jnp.argmax(results != dfx.RESULTS.successful)
@@ -117,7 +117,7 @@ class AbstractComposition(AbstractPresymplecticSolver[PyTree]):
 
         stages = stage_table(self.weights, h)
         state = (end, bar, gradient)
-        (start, bar, gradient), _ = lax.scan(stage, state, stages, reverse=True)
+        (start, bar, gradient), _ = scan_stages(stage, state, stages, reverse=True)
         return start, gradient, bar
 
     def slope(self, view: View, t, y: State, carry: PyTree) -> State:

@@ -2,12 +2,12 @@ import math
 from typing import TYPE_CHECKING
 
 import equinox as eqx
-import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Inexact
 
 from .._misc import as_parameter, as_positive, cast_to, tree_add, tree_scale, tree_sub
+from .._scan import scan_stages
 from .._term import State, View
 from ._base import AbstractPresymplecticSolver, Clock, stage_table
 from ._tableaus import (
@@ -73,7 +73,7 @@ class _AbstractCopies(AbstractPresymplecticSolver):
 
         stages = stage_table(_WEIGHTS[self.composed_order], h)
         start = y, copy, paired_field(view, t0, y, copy)
-        (y, copy, _), _ = lax.scan(stage, start, stages)
+        (y, copy, _), _ = scan_stages(stage, start, stages)
         return y, copy
 
 

@@ -3,13 +3,13 @@ from typing import ClassVar, TYPE_CHECKING
 
 import equinox as eqx
 import jax
-import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
 from .._misc import cast_to, tree_add, tree_sum
+from .._scan import scan_stages
 from .._term import State, View
 from ._base import AbstractPresymplecticSolver, Clock, pull_back, stage_table
 from ._tableaus import (
@@ -75,7 +75,7 @@ class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
 
         table = stage_table(drifts, h)
         paired = *(x[: len(kicks)] for x in table), cast_to(np.array(kicks), h)
-        (y, carry), _ = lax.scan(stage, (y, carry), paired)
+        (y, carry), _ = scan_stages(stage, (y, carry), paired)
         if not kick_first:
             start, _, drift = (x[-1] for x in table)
             y = view.drift(clock(start), drift * h, y, order)
@@ -124,7 +124,7 @@ class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
             force_bar = jtu.tree_map(jnp.zeros_like, y[1])
         paired = *(x[: len(kicks)] for x in table), cast_to(np.array(kicks), h)
         state = (y, y_bar, force_bar), gradient
-        ((y, y_bar, _), gradient), _ = lax.scan(stage, state, paired, reverse=True)
+        ((y, y_bar, _), gradient), _ = scan_stages(stage, state, paired, reverse=True)
         if kick_first:
             force = view.potential_force(t0, y)
             first = fractions[0] * h

@@ -1,0 +1,142 @@
+"""The loop over the stages, and the numbers that are taken out of it."""
+
+import diffrax as dfx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffrax_presym as dps
+from diffrax_presym._scan import scan_stages
+
+
+TIMES, LENGTHS = jnp.array([0.1, 0.2, 0.4]), jnp.array([1.0, -2.0, 3.0])
+
+
+def by(scan, rate, y, reverse=False):
+    def stage(y, moves):
+        t, length = moves
+        factor = jnp.exp(-rate * t)  # a number that does not need the state
+        wide = jnp.log1p(t) * jnp.linspace(0, 1, y.size)  # more than a number
+        y = y + factor * length * jnp.sin(y) + wide
+        return y, (factor, jnp.sum(y), None)
+
+    return scan(stage, y, (TIMES, LENGTHS), reverse=reverse)
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+@pytest.mark.parametrize("n", [2, 40])
+def test_as_a_scan(n, reverse):
+    y, rate = jnp.linspace(-1.0, 1.0, n), jnp.array(0.3)
+    both = [by(scan, rate, y, reverse) for scan in (scan_stages, lax.scan)]
+    assert jax.tree.structure(both[0]) == jax.tree.structure(both[1])
+    for x, y in zip(*map(jax.tree.leaves, both), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "through",
+    [
+        lambda f, *x: jax.grad(f, argnums=(0, 1))(*x),
+        lambda f, *x: jax.jvp(f, x, x),
+        lambda f, *x: jax.jvp(jax.grad(f), x, x),
+        lambda f, r, y: jax.vmap(f)(jnp.array([0.1, 0.2]), jnp.stack([y, -y])),
+    ],
+    ids=["reverse", "forward", "second", "vmap"],
+)
+def test_transformed_as_a_scan(through):
+    y, rate = jnp.linspace(-1.0, 1.0, 40), jnp.array(0.3)
+    last = lambda scan: lambda rate, y: jnp.sum(by(scan, rate, y)[0] ** 2)
+    both = [through(jax.jit(last(scan)), rate, y) for scan in (scan_stages, lax.scan)]
+    for x, y in zip(*map(jax.tree.leaves, both), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-12)
+
+
+def test_effects_stay_in_the_loop(capsys):
+    def stage(y, t):
+        jax.debug.print("{}", t)
+        return y + t, None
+
+    jax.block_until_ready(scan_stages(stage, jnp.zeros(40), TIMES))
+    jax.effects_barrier()
+    assert capsys.readouterr().out.split() == ["0.1", "0.2", "0.4"]
+
+
+def solve(solver, damping, n, gamma=None, adjoint=None):
+    system = dps.ConformalHamiltonian(
+        dps.QuadraticKinetic(),
+        # A drive, so that the force too knows the time.
+        lambda t, q, args: jnp.sum(q**2 / 2 + q**4 / 4 - jnp.cos(t) * q),
+        damping if gamma is None else damping(gamma),
+    )
+    return dfx.diffeqsolve(
+        dps.HamiltonianTerm(system),
+        solver,
+        t0=1.0,
+        t1=3.0,
+        dt0=0.25,
+        y0=(jnp.full(n, 0.5), jnp.full(n, 0.1)),
+        adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+    ).ys
+
+
+@pytest.mark.parametrize(
+    "damping",
+    [
+        dps.LogDamping(3.0),
+        lambda t: t**2 / 4,
+    ],
+    ids=["log", "function"],
+)
+@pytest.mark.parametrize(
+    "solver",
+    [
+        dps.BlanesMoan6(),
+        dps.BlanesMoanRKN4(),
+        dps.PresymplecticYoshida4(),
+        dps.PresymplecticCoupled(4),
+        dps.Substeps(dps.Strang(), 3),
+    ],
+    ids=lambda solver: type(solver).__name__,
+)
+def test_many_unknowns_move_as_one(solver, damping):
+    one, many = solve(solver, damping, 1), solve(solver, damping, 40)
+    for x, y in zip(one, many, strict=True):
+        np.testing.assert_allclose(y, jnp.broadcast_to(x, y.shape), rtol=1e-13)
+
+
+@pytest.mark.parametrize("solver", [dps.BlanesMoanRKN6(), dps.Suzuki4()])
+def test_gradient_with_many_unknowns(solver):
+    def total(gamma, adjoint, n):
+        return jnp.sum(solve(solver, dps.LogDamping, n, gamma, adjoint)[0] ** 2)
+
+    one = jax.grad(total)(2.0, dfx.RecursiveCheckpointAdjoint(), 1)
+    many = jax.grad(total)(2.0, dps.ReversibleAdjoint(), 40)
+    np.testing.assert_allclose(many, 40 * one, rtol=1e-11)
+
+
+def test_no_logarithm_in_the_loop():
+    # 40 unknowns take one logarithm a stage before the loop and none within.
+    def stages(n):
+        program = jax.make_jaxpr(
+            lambda: solve(dps.BlanesMoanRKN6(), dps.LogDamping(3.0), n)
+        )()
+        return [
+            eqn for eqn in _equations(program.jaxpr) if eqn.params.get("length") == 14
+        ]
+
+    inside = lambda eqn: "log1p" in str(eqn.params["jaxpr"])
+    assert any(map(inside, stages(2)))
+    assert stages(40) and not any(map(inside, stages(40)))
+
+
+def _equations(jaxpr):
+    for eqn in jaxpr.eqns:
+        yield eqn
+        for inner in jax.tree.leaves(
+            eqn.params, is_leaf=lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr")
+        ):
+            inner = getattr(inner, "jaxpr", inner)
+            if hasattr(inner, "eqns"):
+                yield from _equations(inner)
