@@ -14,6 +14,9 @@ from jaxtyping import PyTree
 
 # Entries of the loop's state from which on a table costs less than it saves, measured.
 _MANY = 16
+# What would no longer be the same if done for all stages at once: a branch that is not
+# taken may not be a number, and a callback need not know of arrays.
+_ALONE = {"cond", "pure_callback"}
 
 
 def scan_stages(stage: Callable, init: PyTree, moves: PyTree, reverse: bool = False):
@@ -33,6 +36,7 @@ def scan_stages(stage: Callable, init: PyTree, moves: PyTree, reverse: bool = Fa
     known, before, within = {*jaxpr.constvars, *of_moves}, [], []
     for eqn in jaxpr.eqns:
         early = known.issuperset(_variables(eqn.invars)) and not eqn.effects
+        early = early and _ALONE.isdisjoint(_primitives(eqn))
         if early and all(x.aval.size < _MANY for x in eqn.outvars):
             before.append(eqn)
             known.update(eqn.outvars)
@@ -60,3 +64,11 @@ def scan_stages(stage: Callable, init: PyTree, moves: PyTree, reverse: bool = Fa
 
 def _variables(atoms) -> list:
     return [x for x in atoms if not isinstance(x, Literal)]
+
+
+def _primitives(eqn):
+    """The names of all operations of an equation, also of those within it."""
+    yield eqn.primitive.name
+    for x in jtu.tree_leaves(eqn.params):
+        for inner in getattr(getattr(x, "jaxpr", x), "eqns", ()):
+            yield from _primitives(inner)
