@@ -14,9 +14,6 @@ from jaxtyping import PyTree
 
 # Entries of the loop's state from which on a table costs less than it saves, measured.
 _MANY = 16
-# What would no longer be the same if done for all stages at once: a branch that is not
-# taken may not be a number, and a callback need not know of arrays.
-_ALONE = {"cond", "pure_callback"}
 
 
 def scan_stages(stage: Callable, init: PyTree, moves: PyTree, reverse: bool = False):
@@ -36,7 +33,8 @@ def scan_stages(stage: Callable, init: PyTree, moves: PyTree, reverse: bool = Fa
     known, before, within = {*jaxpr.constvars, *of_moves}, [], []
     for eqn in jaxpr.eqns:
         early = known.issuperset(_variables(eqn.invars)) and not eqn.effects
-        early = early and _ALONE.isdisjoint(_primitives(eqn))
+        # A callback need not know what to do with all stages at once.
+        early = early and "pure_callback" not in _primitives(eqn)
         if early and all(x.aval.size < _MANY for x in eqn.outvars):
             before.append(eqn)
             known.update(eqn.outvars)

@@ -63,19 +63,6 @@ def test_effects_stay_in_the_loop(capsys):
     assert capsys.readouterr().out.split() == ["0.1", "0.2", "0.4"]
 
 
-def test_branches_stay_branches():
-    # For all stages at once both branches would be taken, and one has no derivative.
-    def last(rate):
-        @jax.jit
-        def scale(t):
-            return lax.cond(t < 1, lambda x: x, lambda x: jnp.sqrt(x - 1), rate * t)
-
-        stage = lambda y, t: (y * scale(t), None)
-        return jnp.sum(scan_stages(stage, jnp.ones(40), jnp.array([0.5, 0.9]))[0])
-
-    np.testing.assert_allclose(jax.grad(last)(1.0), 40 * 2 * 0.45)
-
-
 def test_callbacks_are_called_with_numbers():
     def stage(y, t):
         result = jax.ShapeDtypeStruct((), t.dtype)
