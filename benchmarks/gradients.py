@@ -1,12 +1,13 @@
 """Gradients of long solves: time and memory, by four ways to get them.
 
-The leapfrog on damped pendulums, all in one process, compiled and warmed up, by turns,
-medians. A ratio is the time of value and gradient, with respect to the initial state
-and the damping, over that of the same solve alone. Beside `ReversibleAdjoint` stand
-Diffrax's `RecursiveCheckpointAdjoint`, its default, and reverse mode through a
-`lax.scan` written by hand, whose number of steps is fixed when it is compiled. Runs
-that would take too long or too much memory are left out, and those of minutes are made
-once.
+The leapfrog, all in one process, compiled and warmed up, by turns, medians; on damped
+pendulums, whose sines take most of the time, and on springs with a cubic force, which
+takes next to none. A ratio is the time of value and gradient, with respect to the
+initial state and the damping, over that of the same solve alone. Beside
+`ReversibleAdjoint` stand Diffrax's `RecursiveCheckpointAdjoint`, its default, and
+reverse mode through a `lax.scan` written by hand, whose number of steps is fixed when
+it is compiled. Runs that would take too long or too much memory are left out, and those
+of minutes are made once.
 
 Memory is what XLA says that the compiled program needs besides its arguments.
 """
@@ -33,14 +34,17 @@ MOST = {"reversible": 1e10, "checkpointed": 2e7, "scan": 3e7}
 LONG = 3e8  # beyond which a program runs once, and is its own warm-up
 
 
-def potential(t, q, args):
-    return -jnp.sum(jnp.cos(q))
+SYSTEMS = {
+    "pendulums": lambda t, q, args: -jnp.sum(jnp.cos(q)),
+    "springs": lambda t, q, args: jnp.sum(q**2 / 2 + q**4 / 4),
+}
+FORCES = {"pendulums": lambda q: -jnp.sin(q), "springs": lambda q: -q - q**3}
 
 
-def by_diffrax(adjoint, steps):
+def by_diffrax(system, adjoint, steps):
     def loss(y0, gamma):
         hamiltonian = dps.ConformalHamiltonian(
-            dps.QuadraticKinetic(), potential, dps.ConstantDamping(gamma)
+            dps.QuadraticKinetic(), SYSTEMS[system], dps.ConstantDamping(gamma)
         )
         sol = dfx.diffeqsolve(
             dps.HamiltonianTerm(hamiltonian),
@@ -59,18 +63,18 @@ def by_diffrax(adjoint, steps):
     return loss
 
 
-def by_scan(steps):
+def by_scan(system, steps):
     """The same scheme as one would write it."""
-    h = T1 / steps
+    h, force = T1 / steps, FORCES[system]
 
     def loss(y0, gamma):
         decay = jnp.exp(-gamma * h / 2)
 
         def step(y, _):
             q, p = y
-            p = decay * (p - h / 2 * jnp.sin(q))
+            p = decay * (p + h / 2 * force(q))
             q = q + h * p / 2 * (1 + decay) / decay
-            p = decay * p - h / 2 * jnp.sin(q)
+            p = decay * p + h / 2 * force(q)
             return (q, p), None
 
         y, _ = jax.lax.scan(step, y0, length=steps)
@@ -79,13 +83,13 @@ def by_scan(steps):
     return loss
 
 
-def methods(steps):
+def methods(system, steps):
     with_gradient = lambda loss: jax.value_and_grad(loss, argnums=(0, 1))
     return {
-        "solve": by_diffrax(REVERSIBLE, steps),
-        "reversible": with_gradient(by_diffrax(REVERSIBLE, steps)),
-        "checkpointed": with_gradient(by_diffrax(CHECKPOINTED, steps)),
-        "scan": with_gradient(by_scan(steps)),
+        "solve": by_diffrax(system, REVERSIBLE, steps),
+        "reversible": with_gradient(by_diffrax(system, REVERSIBLE, steps)),
+        "checkpointed": with_gradient(by_diffrax(system, CHECKPOINTED, steps)),
+        "scan": with_gradient(by_scan(system, steps)),
     }
 
 
@@ -103,9 +107,9 @@ def seconds(program, inputs):
     return time.perf_counter() - start
 
 
-def times(sizes, counts, repeats):
+def times(system, sizes, counts, repeats):
     names = list(MOST)
-    print("Value and gradient over the solve alone")
+    print(f"Value and gradient over the solve alone, {system}")
     print(f"{'unknowns':>9} {'steps':>7} {'solve, ms':>10}", end="")
     print("".join(f"{name:>14}" for name in names))
     for n in sizes:
@@ -113,7 +117,7 @@ def times(sizes, counts, repeats):
         for steps in counts:
             programs = {
                 name: compiled(loss, n)
-                for name, loss in methods(steps).items()
+                for name, loss in methods(system, steps).items()
                 if n * steps <= MOST.get(name, MOST["reversible"])
             }
             once = n * steps > LONG
@@ -135,11 +139,11 @@ def times(sizes, counts, repeats):
 
 
 def memory(n, counts):
-    print(f"\nMemory of value and gradient at {n} unknowns, MB")
+    print(f"Memory of value and gradient at {n} unknowns, MB")
     print(f"{'steps':>9}" + "".join(f"{name:>14}" for name in MOST))
     for steps in counts:
         row = ""
-        for name, loss in methods(steps).items():
+        for name, loss in methods("pendulums", steps).items():
             if name in MOST:
                 analysis: Any = compiled(loss, n).memory_analysis()
                 used = analysis.temp_size_in_bytes
@@ -152,12 +156,13 @@ def main():
     parser.add_argument("--quick", action="store_true", help="a short run, for CI")
     quick = parser.parse_args().quick
     print(f"{jax.devices()[0].device_kind}, median of {2 if quick else 5} runs\n")
+    sizes, counts = (1, 1000, 100000), (1000, 10000, 100000)
     if quick:
-        times((1,), (1000,), 2)
-        memory(1000, (1000, 10000))
-    else:
-        times((1, 1000, 100000), (1000, 10000, 100000), 5)
-        memory(1000, (1000, 10000, 100000, 1000000))
+        sizes, counts = (1,), (1000,)
+    for system in SYSTEMS:
+        times(system, sizes, counts, 2 if quick else 5)
+        print()
+    memory(1000, (1000, 10000) if quick else (1000, 10000, 100000, 1000000))
 
 
 if __name__ == "__main__":
