@@ -166,6 +166,17 @@ def test_step_to_and_splitting_dense_output():
     check(saveat=dfx.SaveAt(ts=TS), solver=dps.BlanesMoanRKN6(), **kwargs)
 
 
+@eqx.filter_jit
+def _saving_steps(t0, t1, dt0, y0):
+    dtype = y0[0].dtype
+    term = dps.HamiltonianTerm(separable(GAMMA.astype(dtype)))
+    saveat = dfx.SaveAt(t0=True, steps=True)
+    stiffness = STIFFNESS.astype(dtype)
+    return dfx.diffeqsolve(
+        term, LEAPFROG, t0, t1, dt0, y0, stiffness, saveat=saveat, max_steps=32
+    )
+
+
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64], ids=lambda x: x.__name__)
 @pytest.mark.parametrize(
     "t0, t1, dt0",
@@ -174,12 +185,7 @@ def test_step_to_and_splitting_dense_output():
 def test_steps_are_found_again_to_rounding(t0, t1, dt0, dtype):
     t0, t1, dt0 = (jnp.asarray(t, dtype) for t in (t0, t1, dt0))
     y0 = (jnp.ones(1, dtype), jnp.zeros(1, dtype))
-    term = dps.HamiltonianTerm(separable(GAMMA.astype(dtype)))
-    saveat = dfx.SaveAt(t0=True, steps=True)
-    stiffness = STIFFNESS.astype(dtype)
-    sol = dfx.diffeqsolve(
-        term, LEAPFROG, t0, t1, dt0, y0, stiffness, saveat=saveat, max_steps=32
-    )
+    sol = _saving_steps(t0, t1, dt0, y0)
     n = int(sol.stats["num_steps"])
     time = _clock(dfx.ConstantStepSize(), t0, t1, dt0)
     with jax.numpy_dtype_promotion("standard"):  # as within `diffeqsolve`

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, each, flat, pendulum, Scheme, solve, WAYS
+from helpers import assert_close, CARRIES, each, flat, pendulum, Scheme, solve
 
 import diffrax_presym as dps
 
@@ -74,7 +74,7 @@ def dense(solver, dt0=0.3, **kwargs):
     )
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", ["leapfrog", "BlanesMoanRKN6"])
 def test_dense_output_is_exact_at_the_steps(name):
     sol = dense(SOLVERS[name][0])
     steps = np.asarray(sol.ts)
@@ -159,7 +159,7 @@ def at_the_steps(sol):
 
 
 @pytest.mark.parametrize("t0, t1", [(0.0, T1), (T1, 0.0)], ids=["there", "back"])
-@each(WAYS)
+@each(CARRIES)
 def test_value_and_slope_at_the_steps_of_every_scheme(scheme: Scheme, t0, t1):
     dt0 = (t1 - t0) / 8
     saveat = dfx.SaveAt(t0=True, steps=True, dense=True)

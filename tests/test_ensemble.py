@@ -7,8 +7,6 @@ import signal
 import subprocess
 import sys
 
-import pytest
-
 
 EXAMPLE = pathlib.Path(__file__).parent.parent / "examples" / "ensemble.py"
 FREE = {"constant steps", "adaptive steps, in shard_map", "an event, in shard_map"}
@@ -50,7 +48,6 @@ def reports(output):
     return found
 
 
-@pytest.mark.slow
 def test_over_devices(tmp_path):
     code, output, errors = run(tmp_path, "--devices", "8", limit=200)
     assert code == 0, errors
@@ -67,7 +64,6 @@ def test_over_devices(tmp_path):
     assert {name for name in rows if "in each step" in rows[name]} == IN_EACH_STEP
 
 
-@pytest.mark.slow
 def test_over_processes(tmp_path):
     code, output, errors = run(tmp_path, "--processes", "2", limit=200)
     assert code == 0, errors
@@ -80,7 +76,6 @@ def test_over_processes(tmp_path):
         assert communication == "none"
 
 
-@pytest.mark.slow
 def test_processes_end_at_the_limit(tmp_path):
     options = "--processes", "2", "--timeout", "0.5"
     # It returns only when all have ended that could write to its output.

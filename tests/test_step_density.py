@@ -53,9 +53,12 @@ def solve(controller, solver, t0, t1, y0, **kwargs) -> Any:
     )
 
 
-@pytest.mark.parametrize("density", DENSITIES)
-@pytest.mark.parametrize("solver", [dps.PresymplecticLeapfrog(), dps.BlanesMoanRKN6()])
-def test_a_solve_goes_back_the_way_it_came(density, solver):
+@pytest.mark.parametrize(
+    "solver, density",
+    [(dps.BlanesMoanRKN6(), "distance")]
+    + [(dps.PresymplecticLeapfrog(), density) for density in ("arclength", "own")],
+)
+def test_a_solve_goes_back_the_way_it_came(solver, density):
     controller = dps.StepDensityController(KEPLER, 0.05, DENSITIES[density])
     steps = 300
     saveat = dfx.SaveAt(t0=True, steps=True, controller_state=True)

@@ -14,6 +14,7 @@ import pytest
 from helpers import (
     ANY,
     assert_close,
+    CARRIES,
     each,
     few,
     flat,
@@ -24,6 +25,7 @@ from helpers import (
     SCHEMES,
     step,
     trajectory,
+    WAYS,
 )
 from jax.flatten_util import ravel_pytree
 
@@ -131,7 +133,8 @@ def contraction(eta):
     return float(np.exp(eta(T0) - eta(T1)))
 
 
-@few(DAMPINGS, SCHEMES)
+@pytest.mark.parametrize("case", DAMPINGS)
+@each(CARRIES)
 def test_form_contracts_with_the_damping(scheme: Scheme, case):
     law, eta = DAMPINGS[case]
     assert structure_defect(quadratic(law), scheme, contraction(eta)) < 1e-13
@@ -275,7 +278,7 @@ def check_canonical(scheme: Scheme, hamiltonian, H, tolerance):
     assert_close(solution, [q, p], tolerance)
 
 
-@few(PAIRS, [scheme for scheme in SCHEMES if scheme.name in paper.SCHEMES])
+@few(PAIRS, [scheme for scheme in WAYS if scheme.name in paper.SCHEMES])
 def test_solution_is_the_paper_s_in_canonical_momentum(scheme: Scheme, case):
     hamiltonian, H = PAIRS[case]
     check_canonical(scheme, hamiltonian, H, 1e-12)
