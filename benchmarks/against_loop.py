@@ -148,8 +148,8 @@ def main():
     if quick:
         sizes = {n: steps // 50 for n, steps in sizes.items()}
     print(
-        f"{'potential':>10} {'unknowns':>8} {'scheme, saved':>36}"
-        f" {'ours':>10} {'loop':>10} {'ratio':>6}"
+        f"{'potential':>9} {'unknowns':>8} {'scheme, saved':>26}"
+        f" {'ours, ns':>9} {'loop, ns':>9} {'ratio':>6}"
     )
     for name, potential in POTENTIALS.items():
         leapfrog, splitting = leapfrog_loop(potential), splitting_loop(potential)
@@ -183,8 +183,8 @@ def main():
             for case, (solve, loop) in cases.items():
                 mine, theirs, ratio = compare(solve, loop, q, p, steps, repeats)
                 print(
-                    f"{name:>10} {n:>8} {case:>36} {mine * 1e9:>7.0f} ns"
-                    f" {theirs * 1e9:>7.0f} ns {ratio:>6.2f}",
+                    f"{name:>9} {n:>8} {case:>26} {mine * 1e9:>9.0f}"
+                    f" {theirs * 1e9:>9.0f} {ratio:>6.2f}",
                     flush=True,
                 )
 

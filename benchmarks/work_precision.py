@@ -185,21 +185,17 @@ def best_of(curves, group, target):
 
 
 def table(results):
-    print(
-        f"\n{'time to reach an error, us':26}" + "".join(f"{t:>44.0e}" for t in TARGETS)
-    )
     ratios = {target: [] for target in TARGETS}
     heyoka = {target: [] for target in TARGETS}
-    for problem, curves in results.items():
-        for group in ("ours", "diffrax", "outside"):
-            row = f"{problem if group == 'ours' else '':26}"
-            for target in TARGETS:
-                seconds, name = best_of(curves, group, target)
-                row += f"{name:>32} {seconds * 1e6:>11.0f}"
-            print(row)
-        for target in TARGETS:
-            ours, _ = best_of(curves, "ours", target)
-            ratios[target].append(best_of(curves, "diffrax", target)[0] / ours)
+    for target in TARGETS:
+        header = "".join(f"{x:>19} {'us':>6}" for x in ("ours", "Diffrax's"))
+        print(f"\n{f'to an error of {target:.0e}':23}{header}")
+        for problem, curves in results.items():
+            best = [best_of(curves, group, target) for group in ("ours", "diffrax")]
+            row = "".join(f"{name:>19} {x * 1e6:>6.0f}" for x, name in best)
+            print(f"{problem:23}{row}")
+            ours = best[0][0]
+            ratios[target].append(best[1][0] / ours)
             theirs = [
                 time_to(c, target) for (_, n), c in curves.items() if n == "heyoka"
             ]
@@ -220,12 +216,12 @@ def show(ratios, form):
 
 
 def picture(results, path):
-    columns = 4
+    columns = 2
     rows = math.ceil(len(results) / columns)
     fig, axes = plt.subplots(
         rows,
         columns,
-        figsize=(4.4 * columns, 4 * rows),
+        figsize=(4.6 * columns, 3.4 * rows),
         layout="constrained",
         squeeze=False,
     )
@@ -239,14 +235,16 @@ def picture(results, path):
         ax.set(
             title=problem, xlabel="relative error at the final time", xlim=(1e1, 1e-15)
         )
-        ax.set_ylabel("time of one solve (microseconds)")
+        ax.set_ylabel("microseconds")
         ax.grid(alpha=0.3)
     for ax in axes.flat[len(results) :]:
         ax.axis("off")
     handles = [Line2D([], [], color=colors[k], ls=styles[k[0]][1:]) for k in names]
     where = axes.flat[len(results)] if len(results) < axes.size else axes.flat[-1]
-    where.legend(handles, [name for _, name in names], fontsize=8, loc="center")
-    fig.savefig(path, dpi=90)
+    where.legend(
+        handles, [name for _, name in names], fontsize=9, ncols=2, loc="center"
+    )
+    fig.savefig(path, dpi=110)
 
 
 def main():
