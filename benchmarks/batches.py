@@ -237,10 +237,8 @@ def tune_all(batch, methods, errors):
 def scaling(batch, methods, sizes, repeats, longest):
     errors = Errors(batch, min(max(sizes), CHECKED))
     tuned = tune_all(batch, methods, errors)
-    head = "".join(f"{f'batch of {n}':>18}" for n in sizes)
-    print(
-        f"\nMicroseconds per trajectory, and error\n{'':24}{head}{'trajectories/s':>16}"
-    )
+    head = "".join(f"{f'batch of {n}':>16}" for n in sizes)
+    print(f"\nMicroseconds per trajectory, and error\n{'':24}{head}{'per second':>11}")
     for target in TARGETS:
         cells = {method.name: [] for method in methods}
         rates = dict.fromkeys(cells, 0.0)
@@ -260,13 +258,13 @@ def scaling(batch, methods, sizes, repeats, longest):
                 each = seconds / n
                 last[name] = each if n >= 64 else 0.0
                 rates[name] = max(rates[name], 1 / each)
-                cells[name].append(f"{each * 1e6:>10.1f} {errors.of(y):.0e}")
+                cells[name].append(f"{each * 1e6:.1f} {errors.of(y):.0e}")
             for name in cells.keys() - found.keys():
                 cells[name].append("-")
         print(f"error {target:.0e}")
         for name, row in cells.items():
-            rate = f"{rates[name]:>16.0f}" if rates[name] else f"{'-':>16}"
-            print(f"  {name:22}" + "".join(f"{c:>18}" for c in row) + rate, flush=True)
+            rate = f"{rates[name]:>11.0f}" if rates[name] else f"{'-':>11}"
+            print(f"  {name:22}" + "".join(f"{c:>16}" for c in row) + rate, flush=True)
 
 
 def heyoka_runs(batch, n, errors):
@@ -337,14 +335,14 @@ def beside_heyoka(batch, methods, n, repeats):
                 for target in TARGETS:
                     _, x = tuned[method.name, target]
                     if x is not None:
-                        key = f"{method.name:20} {how}", target
+                        key = f"{method.name:17}{how}", target
                         calls[key] = program(solve, y0, x)
     calls |= heyoka_runs(batch, n, errors)
     found = by_turns(calls, repeats)
     print(
         f"\n{batch.problem.name}, a batch of {n}: microseconds per trajectory, "
-        f"of all cores, and error\n{'':46}"
-        + "".join(f"{f'error {t:.0e}':>24}" for t in TARGETS)
+        f"of all cores, and error\n{'':48}"
+        + "".join(f"{f'error {t:.0e}':>22}" for t in TARGETS)
     )
     for name in dict.fromkeys(name for name, _ in calls):
         row = ""
@@ -354,11 +352,12 @@ def beside_heyoka(batch, methods, n, repeats):
                 y, *times = found[name, target]
                 us = [t / n * 1e6 for t in times]
                 cell = f"{us[0]:.1f} {us[1]:>7.1f} {errors.of(y):.0e}"
-            row += f"{cell:>24}"
-        print(f"{name:46}{row}")
+            row += f"{cell:>22}"
+        print(f"{name:48}{row}")
     print("\nThe best of each over our best: in time (in time of all cores)")
     rivals = {"Diffrax": names(DIFFRAX)}
     rivals |= {name: name for name, _ in calls if name.startswith("heyoka")}
+    print(f"{'':26}" + "".join(f"{rival:>22}" for rival in rivals))
     for target in TARGETS:
         for variant in batch.variants:
             row = []
@@ -369,8 +368,9 @@ def beside_heyoka(batch, methods, n, repeats):
                     / best(found, target, names(OURS), variant, clock)
                     for clock in (1, 2)
                 )
-                row.append(f"{rival} {time:.1f} ({cores:.1f})")
-            print(f"  at {target:.0e}, {variant}: " + ", ".join(row))
+                row.append(f"{time:.1f} ({cores:.1f})")
+            case = f"{target:.0e}, {variant}"
+            print(f"  {case:24}" + "".join(f"{cell:>22}" for cell in row))
 
 
 def names(methods):
