@@ -33,7 +33,7 @@ demo: $(VENV)/.with-examples  ## Print the quick start's table and save its pict
 	@$(BIN)/python examples/quickstart.py
 
 test: $(VENV)/.with-tests  ## Run all tests
-	@$(BIN)/python -m pytest -q -n $(WORKERS)
+	@$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal
 
 # All that the documentation shows, which is a little of everything; all tests of this by
 # `make oldest TESTS=tests`. Old versions warn of each other, which is not our concern.
