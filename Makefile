@@ -20,7 +20,7 @@ BENCHMARKS := against_loop compile_time schemes work_precision batches nonsepara
 export MPLBACKEND ?= Agg
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test oldest lint format docs serve tutorials examples paper bench clean
+.PHONY: help demo test slow oldest lint format docs serve tutorials examples paper bench clean
 # The targets share one environment, so never two at a time.
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
@@ -32,8 +32,13 @@ help:  ## List the targets
 demo: $(VENV)/.with-examples  ## Print the quick start's table and save its picture
 	@$(BIN)/python examples/quickstart.py
 
-test: $(VENV)/.with-tests  ## Run all tests
-	@$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal
+PYTEST = $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal
+
+test: $(VENV)/.with-tests  ## Run the tests, but for the slowest
+	@$(PYTEST) -m "not slow"
+
+slow: $(VENV)/.with-tests  ## Run the slowest tests: gradients, and more of the same
+	@$(PYTEST) -m slow
 
 # All that the documentation shows, which is a little of everything; all tests of this by
 # `make oldest TESTS=tests`. Old versions warn of each other, which is not our concern.

@@ -107,11 +107,13 @@ def test_gradients_are_those_of_the_computed_numbers(scheme: Scheme):
     check(solver=scheme.solver)
 
 
+@pytest.mark.slow
 @each(named(IMPLICIT, "euler_B"))
 def test_implicit_schemes_reverse_too(scheme: Scheme):
     check(solver=scheme.solver, system=nonseparable, t1=0.5, tolerance=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver",
     [
@@ -160,6 +162,7 @@ def test_cotangents_of_all_that_is_saved(saveat):
     check(saveat=saveat, t1=sign * 1.0, dt0=sign * 0.3)
 
 
+@pytest.mark.slow
 def test_step_to_and_splitting_dense_output():
     ts = jnp.array([0.0, 0.1, 0.3, 0.35, 1.0])
     kwargs: dict[str, Any] = dict(dt0=None, stepsize_controller=dfx.StepTo(ts))
@@ -203,6 +206,7 @@ def test_a_solve_of_no_length():
     assert_close(jtu.tree_leaves(ours)[:3], jtu.tree_leaves(exact), 1e-15)
 
 
+@pytest.mark.slow
 def test_gradients_of_what_a_saved_function_closes_over():
     def gradient(adjoint):
         def loss(scale):
@@ -275,6 +279,7 @@ def test_saved_values_by_central_differences():
         assert_close(slope(zero, i), difference, 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("made_jump", [None, True])
 def test_a_solve_continued_from_another(made_jump):
     """What a solver carries comes from the first half; or is made anew after a jump."""
@@ -310,6 +315,7 @@ def test_a_stale_solver_state_is_an_error():
         jax.block_until_ready(jax.grad(loss)(Y0[0]))
 
 
+@pytest.mark.slow
 def test_an_optimiser_of_optax():
     """Friction and stiffness are found again, by a training loop as users write it."""
 

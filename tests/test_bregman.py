@@ -212,6 +212,7 @@ def exact_end(mirror):
     return flat(solve(H, dfx.Dopri8(), 1.0, 2.0, 1 / 64, (Q, P)).ys)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mirror, scheme",
     [*(("entropy", scheme) for scheme in EXPLICIT), ("simplex", "blanes-moan 4")],
@@ -261,6 +262,7 @@ def test_a_step_backwards_undoes_a_step_of_a_splitting(mirror):
     assert_close(back, (Q, P), 1e-13)
 
 
+@pytest.mark.slow
 def test_quadratic_case_is_the_separable_one():
     c, C = 3.0, 0.4
     bregman = system(NAMED["euclidean"])
@@ -445,6 +447,7 @@ def from_parameters(theta, own):
     }, scaling
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["p-norm", "hyperbolic"])
 def test_gradients_of_mirror_maps_and_scalings(name):
     def loss(theta):

@@ -54,6 +54,7 @@ def exact():
     return jax.tree.map(np.asarray, sol.ys)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("half", ["q", "p"])
 @pytest.mark.parametrize("name", SOLVERS)
 def test_order_between_the_steps(name, half):

@@ -284,6 +284,7 @@ def test_jumps_of_the_force(scheme: Scheme):
     assert_close(jtu.tree_map(lambda y: y[-1], ys), expected, 1e-12)
 
 
+@pytest.mark.slow
 @each(CARRIES)
 def test_half_steps_estimate_the_error(scheme: Scheme, exact):
     tolerance = 1e-3 if scheme.order == 1 else 1e-5
@@ -346,6 +347,7 @@ def test_states_are_any_pytrees(scheme: Scheme):
     assert_close(trees, expected, 1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "q0, p0",
     [(1.0, 0.5), (1, 2), (np.float64(1.0), 2), (jnp.array(1), jnp.array(0.5))],
@@ -440,6 +442,7 @@ OTHERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver, adapts, tolerance", OTHERS.values(), ids=OTHERS)
 def test_the_term_in_other_solvers(solver, adapts, tolerance):
     controller = dfx.PIDController(rtol=1e-8, atol=1e-8)
@@ -494,6 +497,7 @@ MIXED = dps.ConformalHamiltonian(energy=mixed_energy, damping=dps.ConstantDampin
 IMPLICIT_Y0 = (jnp.array([0.5, -0.3]), jnp.array([0.2, 0.4]))
 
 
+@pytest.mark.slow
 @each(IMPLICIT)
 def test_implicit_schemes_solve(scheme: Scheme):
     end = lambda solver, dt0, **kwargs: dfx.diffeqsolve(
@@ -598,6 +602,7 @@ def test_substeps_of_splittings_are_steps(scheme: Scheme):
 # Adjoints
 
 
+@pytest.mark.slow
 @each(SPLITTINGS[:1])
 def test_adjoints_agree(scheme: Scheme):
     def end(gamma, adjoint):
@@ -632,6 +637,7 @@ def jolt(t, q, args):
 
 
 # It converges. That the force carried is new at the jump is what constant forces show.
+@pytest.mark.slow
 @of("leapfrog_AB", "tao")
 def test_a_clipped_solve_is_two_solves(scheme: Scheme):
     system = dps.ConformalHamiltonian(KINETIC, jolt, dps.LogDamping(1.5))

@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 
+import pytest
+
 
 EXAMPLE = pathlib.Path(__file__).parent.parent / "examples" / "ensemble.py"
 FREE = {"constant steps", "adaptive steps, in shard_map", "an event, in shard_map"}
@@ -48,6 +50,7 @@ def reports(output):
     return found
 
 
+@pytest.mark.slow
 def test_over_devices(tmp_path):
     code, output, errors = run(tmp_path, "--devices", "8", limit=200)
     assert code == 0, errors
@@ -64,6 +67,7 @@ def test_over_devices(tmp_path):
     assert {name for name in rows if "in each step" in rows[name]} == IN_EACH_STEP
 
 
+@pytest.mark.slow
 def test_over_processes(tmp_path):
     code, output, errors = run(tmp_path, "--processes", "2", limit=200)
     assert code == 0, errors

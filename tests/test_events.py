@@ -61,6 +61,7 @@ def exact():
     return last(swing(dfx.Dopri8(), 1e-3, max_steps=None))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver, order",
     [
@@ -89,6 +90,7 @@ def test_boolean_event_ends_with_the_step(exact):
     assert sol.result == dfx.RESULTS.event_occurred
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver, adjoint",
     [(dps.PresymplecticLeapfrog(), dfx.DirectAdjoint()), (dps.BlanesMoanRKN6(), None)],
@@ -174,6 +176,7 @@ def oscillate(solver, t1, dt0):
     )
 
 
+@pytest.mark.slow
 @each(CARRIES)
 def test_order_of_the_event_time(scheme: Scheme):
     errors = []
@@ -359,6 +362,7 @@ def test_a_batch_of_which_some_have_an_event():
             assert_close(together, single, 1e-11)
 
 
+@pytest.mark.slow
 def test_event_time_is_differentiable_in_forward_mode():
     def end(gamma):
         solver = dps.PresymplecticTao(5.0)

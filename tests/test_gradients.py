@@ -148,11 +148,13 @@ def test_gradients_of_dense_output():
     check(SEPARABLE, dps.PresymplecticLeapfrog(), CHECKPOINTED, saveat)
 
 
+@pytest.mark.slow
 @each([*named(IMPLICIT, "euler_A"), *named(SCHEMES, "tao")])
 def test_gradients_of_nonseparable_systems(scheme: Scheme):
     check(NONSEPARABLE, scheme.solver, CHECKPOINTED)
 
 
+@pytest.mark.slow
 def test_gradients_by_the_direct_adjoint():
     (scheme,) = named(IMPLICIT, "leapfrog_AB")
     check(NONSEPARABLE, scheme.solver, dfx.DirectAdjoint())

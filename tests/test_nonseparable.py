@@ -244,6 +244,7 @@ def test_outside_of_the_domain_is_a_result(name):
     assert sol.result != dfx.RESULTS.successful
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tao", "coupled", "projected", "midpoint"])
 def test_every_scheme_finds_bregman_motion(name):
     y0 = (jnp.array([0.3, 0.5]), jnp.array([0.1, -0.2]))
@@ -252,6 +253,7 @@ def test_every_scheme_finds_bregman_motion(name):
     assert_close(end, exact, 2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["coupled", "projected"])
 def test_gradients_of_mirror_maps_and_scalings(name):
     y0 = (jnp.array([0.3, 0.5]), jnp.array([0.1, -0.2]))

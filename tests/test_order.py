@@ -5,6 +5,7 @@ import functools
 import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import scipy.integrate
 import scipy.special
 from helpers import (
@@ -230,11 +231,13 @@ def test_order_on_quadratic_kinetic_energies(scheme: Scheme, case):
     check_order(scheme, case)
 
 
+@pytest.mark.slow
 @each([scheme for scheme in WAYS if scheme.kind != "split"])
 def test_order_where_both_energies_depend_on_time(scheme: Scheme):
     check_order(scheme, "driven")
 
 
+@pytest.mark.slow
 @each([*IMPLICIT, *(scheme for scheme in SCHEMES if scheme.kind in ANY)])
 def test_order_on_nonseparable_energies(scheme: Scheme):
     check_order(scheme, "nonseparable")

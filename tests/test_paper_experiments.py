@@ -27,6 +27,7 @@ def as_user():
         yield
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("temperature", [0.8, 2.2, 2.4, 4.0])
 def test_partition_function_by_enumeration(temperature):
     """Both sides of the critical temperature, where a sign changes."""
@@ -42,6 +43,7 @@ def test_partition_function_by_enumeration(temperature):
     np.testing.assert_allclose(ising.log_partition(1 / temperature, 4), log_z)
 
 
+@pytest.mark.slow
 def test_metropolis_draws_from_the_ensemble():
     temperatures = jnp.array([1.5, 2.3, 4.0])
     spins = ising.metropolis(jax.random.key(0), temperatures, 4, 200, 20, 100, 10)
@@ -141,6 +143,7 @@ def test_modes_are_the_matrix():
     )
 
 
+@pytest.mark.slow
 def test_machine_is_trained_by_the_scaled_leapfrog():
     """The scaled updates of the paper, with one random gradient per step."""
     key = jax.random.key(5)

@@ -5,6 +5,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 
 import diffrax_presym as dps
@@ -92,6 +93,7 @@ def solve(solver, damping, n, gamma=None, adjoint=None):
     return sol.ys
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "damping", [dps.LogDamping(3.0), lambda t: t**2 / 4], ids=["log", "function"]
 )
@@ -102,15 +104,17 @@ def solve(solver, damping, n, gamma=None, adjoint=None):
         dps.PresymplecticYoshida4(),
         dps.PresymplecticCoupled(4),
         dps.Substeps(dps.Strang(), 3),
+        dps.Suzuki4(dps.PresymplecticMidpoint(optx.Newton(1e-13, 1e-13))),
     ],
     ids=lambda solver: type(solver).__name__,
 )
 def test_many_unknowns_move_as_one(solver, damping):
-    one, many = solve(solver, damping, 1), solve(solver, damping, 40)
+    one, many = solve(solver, damping, 1), solve(solver, damping, 10)
     for x, y in zip(one, many, strict=True):
         np.testing.assert_allclose(y, jnp.broadcast_to(x, y.shape), rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_gradient_with_many_unknowns():
     def total(gamma, adjoint, n):
         solver = dps.BlanesMoanRKN4()

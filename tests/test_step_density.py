@@ -53,6 +53,7 @@ def solve(controller, solver, t0, t1, y0, **kwargs) -> Any:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver, density",
     [(dps.BlanesMoanRKN6(), "distance")]

@@ -153,6 +153,7 @@ def test_form_contracts_for_any_kinetic_energy(scheme: Scheme):
     assert structure_defect(hamiltonian, scheme, contraction(eta)) < 1e-13
 
 
+@pytest.mark.slow
 @each([*IMPLICIT, *AUGMENTED])
 def test_form_contracts_for_nonseparable_energies(scheme: Scheme):
     law, eta = DAMPINGS["logarithmic"]
@@ -201,6 +202,7 @@ def test_a_step_backwards_undoes_a_step(scheme: Scheme, hamiltonian):
     check_symmetry(hamiltonian, scheme.solver, scheme.solver, 2e-14)
 
 
+@pytest.mark.slow
 @each([*IMPLICIT, *AUGMENTED], symmetric=True)
 def test_a_step_backwards_undoes_a_nonseparable_step(scheme: Scheme):
     hamiltonian = dps.ConformalHamiltonian(
@@ -278,12 +280,14 @@ def check_canonical(scheme: Scheme, hamiltonian, H, tolerance):
     assert_close(solution, [q, p], tolerance)
 
 
+@pytest.mark.slow
 @few(PAIRS, [scheme for scheme in WAYS if scheme.name in paper.SCHEMES])
 def test_solution_is_the_paper_s_in_canonical_momentum(scheme: Scheme, case):
     hamiltonian, H = PAIRS[case]
     check_canonical(scheme, hamiltonian, H, 1e-12)
 
 
+@pytest.mark.slow
 @each([scheme for scheme in [*IMPLICIT, *AUGMENTED] if scheme.name in paper.SCHEMES])
 def test_nonseparable_solution_is_the_paper_s(scheme: Scheme):
     tolerance = 1e-10 if scheme in IMPLICIT else 1e-12
