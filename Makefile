@@ -40,9 +40,10 @@ test: $(VENV)/.with-tests  ## Run the tests, but for the slowest
 slow: $(VENV)/.with-tests  ## Run the slowest tests: gradients, and more of the same
 	@$(PYTEST) -m slow
 
-# All that the documentation shows, which is a little of everything; all tests of this by
-# `make oldest TESTS=tests`. Old versions warn of each other, which is not our concern.
-oldest: TESTS ?= tests/test_docs.py
+# All that the documentation shows, which is a little of everything, and the loop over
+# stages, which takes JAX's programs apart; all tests of this by `make oldest TESTS=tests`.
+# Old versions warn of each other, which is not our concern.
+oldest: TESTS ?= tests/test_docs.py tests/test_stages.py
 oldest: $(OLDEST)/.installed  ## Run the documentation with the oldest dependencies
 	@$(OLDEST)/bin/python -m pytest -q -n $(WORKERS) -W ignore::DeprecationWarning $(TESTS)
 
