@@ -398,3 +398,27 @@ def test_no_damping_is_the_limit_of_little_damping():
     for law in (dps.ConstantDamping, dps.LogDamping):
         assert_close(field(law(0.0)), field(None), 1e-16)
         assert_close(field(law(1e-10)), field(None), 1e-9)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_a_relativistic_drift_through_friction_that_stops_it(dtype):
+    p = jnp.array([0.3, -0.4], dtype)
+
+    def moved(gamma):
+        damping = dps.ConstantDamping(gamma)
+        system = dps.ConformalHamiltonian(RELATIVISTIC, potential, damping)
+        start = jnp.zeros((), dtype)
+        q, _ = system.drift(start, jnp.ones((), dtype), jnp.zeros_like(p), p)
+        return q
+
+    # By nodes that all come too late to see it move.
+    gamma = jnp.array(1e4, dtype)
+    np.testing.assert_allclose(moved(gamma), 0.0, atol=1e-15)
+    np.testing.assert_allclose(jax.jacrev(moved)(gamma), 0.0, atol=1e-15)
+    # The closed form, where there are enough nodes.
+    mass, speed = float(RELATIVISTIC.mass), float(RELATIVISTIC.speed)
+    sizes = 0.5 * np.array([1, np.exp(-0.5)]) / (mass * speed)
+    travelled = speed / 0.5 * -np.diff(np.arcsinh(sizes))
+    exact = travelled * np.asarray(p) / 0.5
+    gamma = jnp.array(0.5, dtype)
+    np.testing.assert_allclose(moved(gamma), exact, rtol=1e-6)

@@ -209,7 +209,9 @@ class RelativisticKinetic(AbstractKinetic):
 
         # The momentum keeps its direction, so that only a number has to be integrated.
         def pace(s):
-            growth = cast_to(jnp.exp(damping.increment(t, s)), square)
+            # By e^40 it has stopped, and the square of much more would overflow.
+            increment = jnp.minimum(damping.increment(t, s), 40)
+            growth = cast_to(jnp.exp(increment), square)
             return 1 / jnp.sqrt(square + rest * growth**2)
 
         length = cast_to(self.speed, square) * quadrature(pace, h, order)
