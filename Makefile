@@ -9,6 +9,7 @@ BIN := $(VENV)/bin
 PIP := -m pip --quiet --disable-pip-version-check install
 # Two processes: what a small machine has. `make test WORKERS=auto` takes all there are.
 WORKERS ?= 2
+PYTEST = -m pytest -q -n $(WORKERS) --dist worksteal
 
 EXAMPLES := $(sort $(filter-out examples/_%,$(wildcard examples/*.py)))
 # The experiments of the paper share code, so they are run as modules.
@@ -32,20 +33,18 @@ help:  ## List the targets
 demo: $(VENV)/.with-examples  ## Print the quick start's table and save its picture
 	@$(BIN)/python examples/quickstart.py
 
-PYTEST = $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal
-
 test: $(VENV)/.with-tests  ## Run the tests, but for the slowest
-	@$(PYTEST) -m "not slow"
+	@$(BIN)/python $(PYTEST) -m "not slow"
 
 slow: $(VENV)/.with-tests  ## Run the slowest tests: gradients, and more of the same
-	@$(PYTEST) -m slow
+	@$(BIN)/python $(PYTEST) -m slow
 
 # All that the documentation shows, which is a little of everything, and the loop over
 # stages, which takes JAX's programs apart; all tests of this by `make oldest TESTS=tests`.
 # Old versions warn of each other, which is not our concern.
 oldest: TESTS ?= tests/test_docs.py tests/test_stages.py
 oldest: $(OLDEST)/.installed  ## Run the documentation with the oldest dependencies
-	@$(OLDEST)/bin/python -m pytest -q -n $(WORKERS) -W ignore::DeprecationWarning $(TESTS)
+	@$(OLDEST)/bin/python $(PYTEST) -W ignore::DeprecationWarning $(TESTS)
 
 lint: $(VENV)/.with-lint  ## Check style and types
 	@$(BIN)/ruff check

@@ -8,7 +8,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.core import eval_jaxpr
-from jax.extend.core import Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jaxtyping import PyTree
 
 
@@ -34,8 +34,8 @@ def scan_stages(stage: Callable, init: PyTree, moves: PyTree, reverse: bool = Fa
     for eqn in jaxpr.eqns:
         early = known.issuperset(_variables(eqn.invars)) and not eqn.effects
         # A callback need not know what to do with all stages at once.
-        early = early and "pure_callback" not in _primitives(eqn)
-        if early and all(x.aval.size < _MANY for x in eqn.outvars):
+        alone = any(e.primitive.name == "pure_callback" for e in equations([eqn]))
+        if early and not alone and all(x.aval.size < _MANY for x in eqn.outvars):
             before.append(eqn)
             known.update(eqn.outvars)
         else:
@@ -64,9 +64,10 @@ def _variables(atoms) -> list:
     return [x for x in atoms if not isinstance(x, Literal)]
 
 
-def _primitives(eqn):
-    """The names of all operations of an equation, also of those within it."""
-    yield eqn.primitive.name
-    for x in jtu.tree_leaves(eqn.params):
-        for inner in getattr(getattr(x, "jaxpr", x), "eqns", ()):
-            yield from _primitives(inner)
+def equations(eqns):
+    """All of these equations, and those within their loops, branches and calls."""
+    for eqn in eqns:
+        yield eqn
+        for inner in jtu.tree_leaves(eqn.params):
+            if isinstance(inner, Jaxpr | ClosedJaxpr):
+                yield from equations(inner.eqns)

@@ -79,7 +79,6 @@ WAYS = [
         "strang",
         "tao_4",
         "coupled_4",
-        "projected_4",
     }
 ]
 # One for each kind of what is carried from step to step, all that Diffrax sees of a

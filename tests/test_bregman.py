@@ -244,9 +244,8 @@ def jacobian(H, solver, basis):
 
 @over("entropy", "simplex", "p-norm", "log barrier", "own")
 def test_form_contracts_with_the_scaling(mirror):
-    scheme = "blanes-moan 4"
     basis = TANGENT if mirror.name == "simplex" else np.eye(3)
-    J = np.asarray(jacobian(system(mirror), EXPLICIT[scheme][0], jnp.array(basis)))
+    J = np.asarray(jacobian(system(mirror), dps.BlanesMoan4(), jnp.array(basis)))
     n = basis.shape[1]
     form = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
     contraction = float((T0 / T1) ** 3)

@@ -4,13 +4,13 @@ from typing import Any
 
 import diffrax as dfx
 import jax
-import jax.extend as jex
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import ANY, each, harmonic, oscillator, Scheme, SCHEMES, solve
 
 import diffrax_presym as dps
+from diffrax_presym._scan import equations
 
 
 class Counter:
@@ -85,20 +85,6 @@ def test_dense_output_of_the_leapfrog(first, extra):
 # What is traced, and so could be computed.
 
 
-def equations(jaxpr):
-    """All equations of a jaxpr, inside loops, branches and calls too."""
-    for equation in jaxpr.eqns:
-        yield equation
-        for inner in jax.tree_util.tree_leaves(
-            equation.params, is_leaf=lambda x: isinstance(x, JAXPRS)
-        ):
-            if isinstance(inner, JAXPRS):
-                yield from equations(getattr(inner, "jaxpr", inner))
-
-
-JAXPRS = (jex.core.Jaxpr, jex.core.ClosedJaxpr)
-
-
 def trace(hamiltonian, solver, made_jump: Any = False):
     term = dps.HamiltonianTerm(hamiltonian)
 
@@ -111,7 +97,7 @@ def trace(hamiltonian, solver, made_jump: Any = False):
 
     y = (jnp.array([1.0]), jnp.array([0.0]))
     jaxpr = jax.make_jaxpr(step)(jnp.array(0.0), jnp.array(0.1), y)
-    return list(equations(jaxpr.jaxpr))
+    return list(equations(jaxpr.eqns))
 
 
 def primitives(equations):

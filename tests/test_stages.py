@@ -1,15 +1,15 @@
 """The loop over the stages, and the numbers that are taken out of it."""
 
-import diffrax as dfx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+from helpers import solve
 
 import diffrax_presym as dps
-from diffrax_presym._scan import scan_stages
+from diffrax_presym._scan import equations, scan_stages
 
 
 TIMES, LENGTHS = jnp.array([0.1, 0.2, 0.4]), jnp.array([1.0, -2.0, 3.0])
@@ -73,24 +73,17 @@ def test_callbacks_are_called_with_numbers():
     np.testing.assert_allclose(y, 0.7)
 
 
-def solve(solver, damping, n, gamma=None, adjoint=None):
+def end(solver, damping, n, **kwargs):
     system = dps.ConformalHamiltonian(
         dps.QuadraticKinetic(),
         # A drive, so that the force too knows the time.
         lambda t, q, args: jnp.sum(q**2 / 2 + q**4 / 4 - jnp.cos(t) * q),
-        damping if gamma is None else damping(gamma),
+        damping,
     )
-    sol = dfx.diffeqsolve(
-        dps.HamiltonianTerm(system),
-        solver,
-        t0=1.0,
-        t1=3.0,
-        dt0=0.25,
-        y0=(jnp.full(n, 0.5), jnp.full(n, 0.1)),
-        adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
-    )
-    assert sol.ys is not None
-    return sol.ys
+    y0 = (jnp.full(n, 0.5), jnp.full(n, 0.1))
+    ys = solve(system, solver, 1.0, 3.0, 0.25, y0, **kwargs).ys
+    assert ys is not None
+    return ys
 
 
 @pytest.mark.slow
@@ -109,39 +102,27 @@ def solve(solver, damping, n, gamma=None, adjoint=None):
     ids=lambda solver: type(solver).__name__,
 )
 def test_many_unknowns_move_as_one(solver, damping):
-    one, many = solve(solver, damping, 1), solve(solver, damping, 10)
+    one, many = end(solver, damping, 1), end(solver, damping, 10)
     for x, y in zip(one, many, strict=True):
         np.testing.assert_allclose(y, jnp.broadcast_to(x, y.shape), rtol=1e-13)
 
 
 @pytest.mark.slow
 def test_gradient_with_many_unknowns():
-    def total(gamma, adjoint, n):
-        solver = dps.BlanesMoanRKN4()
-        return jnp.sum(solve(solver, dps.LogDamping, n, gamma, adjoint)[0] ** 2)
+    def total(gamma, n):
+        solver, adjoint = dps.BlanesMoanRKN4(), dps.ReversibleAdjoint()
+        return jnp.sum(end(solver, dps.LogDamping(gamma), n, adjoint=adjoint)[0] ** 2)
 
-    one = jax.grad(total)(2.0, dps.ReversibleAdjoint(), 1)
-    many = jax.grad(total)(2.0, dps.ReversibleAdjoint(), 40)
+    one, many = (jax.grad(total)(2.0, n) for n in (1, 40))
     np.testing.assert_allclose(many, 40 * one, rtol=1e-11)
 
 
 def test_no_logarithm_in_the_loop():
     def stages(n):
-        run = lambda: solve(dps.BlanesMoanRKN6(), dps.LogDamping(3.0), n)
-        equations = _equations(jax.make_jaxpr(run)().jaxpr)
-        return [eqn for eqn in equations if eqn.params.get("length") == 14]
+        run = lambda: end(dps.BlanesMoanRKN6(), dps.LogDamping(3.0), n)
+        traced = equations(jax.make_jaxpr(run)().eqns)
+        return [eqn for eqn in traced if eqn.params.get("length") == 14]
 
     inside = lambda eqn: "log1p" in str(eqn.params["jaxpr"])
     assert any(map(inside, stages(2)))
     assert stages(40) and not any(map(inside, stages(40)))
-
-
-def _equations(jaxpr):
-    for eqn in jaxpr.eqns:
-        yield eqn
-        for inner in jax.tree.leaves(
-            eqn.params, is_leaf=lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr")
-        ):
-            inner = getattr(inner, "jaxpr", inner)
-            if hasattr(inner, "eqns"):
-                yield from _equations(inner)
