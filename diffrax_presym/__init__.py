@@ -24,6 +24,7 @@ from ._hamiltonian import (
     PNormMirror as PNormMirror,
     PolynomialScaling as PolynomialScaling,
     QuadraticKinetic as QuadraticKinetic,
+    QuadraticPotential as QuadraticPotential,
     RelativisticKinetic as RelativisticKinetic,
     Scaling as Scaling,
     SeparableHamiltonian as SeparableHamiltonian,
@@ -56,6 +57,7 @@ from ._solver import (
     Substeps as Substeps,
     Suzuki4 as Suzuki4,
     SuzukiYoshida as SuzukiYoshida,
+    TunedLinear8 as TunedLinear8,
 )
 from ._step_density import (
     ArclengthDensity as ArclengthDensity,

@@ -115,9 +115,20 @@ class View(eqx.Module):
         # force. It would rather recompute an elementwise force wherever it is used.
         return jtu.tree_map(lambda f, q: jnp.where(t == t, f, q), force, y[0])
 
-    def move_frame(self, t, h, p: PyTree) -> PyTree:
-        """`p` from the frame of `t` to the frame of `t + h`."""
-        return move_frame(self.hamiltonian.damping, t, h, p)
+    def values(self, x: PyTree) -> PyTree:
+        """The numbers that stand for `x`, here itself."""
+        return x
+
+    def move_frame(self, t, h, p: PyTree, share: float = 1) -> PyTree:
+        """`p` from the frame of `t` to the frame of `t + h`, if all of it is `p`'s."""
+        return move_frame(self.hamiltonian.damping, t, h, p, share)
+
+    def enter(self, t, y: State) -> State:
+        """The variables that a splitting steps in, here the state itself."""
+        return y
+
+    def leave(self, t, z: State) -> State:
+        return z
 
     def drift(self, t, h, y: State, order: int) -> State:
         """The flow of the kinetic part, frame included."""

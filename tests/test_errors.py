@@ -480,11 +480,11 @@ HAMILTONIANS = {
     ),
     "mass of a wrong structure": (
         lambda: system(dps.QuadraticKinetic({"a": 1.0})),
-        Mistake("got PyTreeDef({'a': *})", "of the structure of `p`", "one mass"),
+        Mistake("got PyTreeDef({'a': *})", "of the structure of `p`", "one number"),
     ),
     "list of masses": (
         lambda: system(dps.QuadraticKinetic([1.0, 2.0])),
-        Mistake("got PyTreeDef([*, *])", "of the structure", "`jnp.array(mass)`"),
+        Mistake("got PyTreeDef([*, *])", "of the structure", "`jnp.array(...)`"),
     ),
     "rest mass": (
         lambda: dps.RelativisticKinetic(mass=0.0),

@@ -28,6 +28,7 @@ from ._mirror import (
     MirrorMap as MirrorMap,
     PNormMirror as PNormMirror,
 )
+from ._potential import QuadraticPotential as QuadraticPotential
 from ._scaling import (
     AbstractScaling as AbstractScaling,
     ExponentialScaling as ExponentialScaling,

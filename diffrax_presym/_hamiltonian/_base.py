@@ -61,6 +61,22 @@ class AbstractHamiltonian(eqx.Module):
     def is_quadratic(self) -> bool:
         """Whether that part is known to be a kinetic energy quadratic in `p`."""
 
+    @property
+    def has_quadratic_potential(self) -> bool:
+        """Whether the energy is known to be a sum of any kinetic energy and a potential
+        quadratic in `q` that does not depend on time."""
+        return False
+
+    @property
+    def has_constant_mass(self) -> bool:
+        """Whether the energy is known to be a sum of `QuadraticKinetic(mass)` and a
+        potential."""
+        return False
+
+    def momentum(self, v: Q) -> P:
+        """The momentum of a velocity, if the mass is constant."""
+        raise NotImplementedError
+
     @abc.abstractmethod
     def drift(
         self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8

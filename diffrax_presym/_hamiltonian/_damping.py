@@ -47,6 +47,14 @@ class AbstractDamping(eqx.Module):
         Exact where the law allows, and otherwise to the given order in `h`.
         """
 
+    def response(self, t: Time, h: Time, order: int) -> Scalar:
+        r"""The integral of $e^{\eta(s) - \eta(t + h)}$ over $s$ from $t$ to $t + h$.
+
+        What a force that is one all the time does to a momentum, which decays with the
+        frame. Exact where the law allows, and otherwise to the given order in `h`.
+        """
+        return quadrature(lambda s: jnp.exp(-self.increment(t + s, h - s)), h, order)
+
 
 class ConstantDamping(AbstractDamping):
     r"""The log scale $\eta(t) = \gamma t$: friction at the constant rate $\gamma$.
@@ -76,6 +84,9 @@ class ConstantDamping(AbstractDamping):
 
     def integral(self, t: Time, h: Time, order: int) -> Scalar:
         return h * _expm1_ratio(-self.increment(t, h))
+
+    def response(self, t: Time, h: Time, order: int) -> Scalar:
+        return self.integral(t, h, order)
 
 
 class LogDamping(AbstractDamping):
@@ -124,6 +135,16 @@ class LogDamping(AbstractDamping):
         growth = jnp.log1p(h / since)
         carried = since * growth * _expm1_ratio((1 - cast_to(self.gamma, t)) * growth)
         return jnp.where(singular, 0, carried)
+
+    def response(self, t: Time, h: Time, order: int) -> Scalar:
+        # With the same x it is (s + h) (1 - exp(-(1 + gamma) x)) / (1 + gamma).
+        since = t + cast_to(self.shift, t)
+        power = 1 + cast_to(self.gamma, t)
+        singular = since == 0
+        since = jnp.where(singular, 1, since)
+        growth = jnp.log1p(h / since)
+        gained = (since + h) * growth * _expm1_ratio(-power * growth)
+        return jnp.where(singular, h / jnp.where(singular, power, 1), gained)
 
 
 class MixedDamping(AbstractDamping):
@@ -188,11 +209,16 @@ class CallableDamping(AbstractDamping):
         return quadrature(lambda s: jnp.exp(-self.increment(t, s)), h, order)
 
 
-def move_frame(damping: AbstractDamping | None, t: Time, h: Time, p: PyTree) -> PyTree:
-    """`exp(eta(t) - eta(t + h)) p`: from the frame of `t` to the frame of `t + h`."""
+def move_frame(
+    damping: AbstractDamping | None, t: Time, h: Time, p: PyTree, share: float = 1
+) -> PyTree:
+    """`exp(eta(t) - eta(t + h)) p`: from the frame of `t` to the frame of `t + h`.
+
+    Or to a power, the share that `p` has in the frame.
+    """
     if damping is None:
         return p
-    increment = _one_number(damping.increment(t, h))
+    increment = share * _one_number(damping.increment(t, h))
     # As a factor, rounding would make the same error at every step, and errors that are
     # the same add up. As an increment they vary with `p`, and mostly cancel.
     return tree_add(p, _expm1(-increment), p)

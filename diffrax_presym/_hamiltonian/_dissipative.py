@@ -41,6 +41,17 @@ class _AbstractDamped(AbstractHamiltonian):
     def is_quadratic(self) -> bool:
         return self.undamped.is_quadratic
 
+    @property
+    def has_quadratic_potential(self) -> bool:
+        return self.undamped.has_quadratic_potential
+
+    @property
+    def has_constant_mass(self) -> bool:
+        return self.undamped.has_constant_mass
+
+    def momentum(self, v: Q) -> P:
+        return self.undamped.momentum(v)
+
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         return self.undamped.energy(t, q, p, args)
 

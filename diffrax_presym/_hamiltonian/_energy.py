@@ -8,7 +8,13 @@ from jaxtyping import PyTree
 from .._misc import all_finite, match, scalar_fn, tree_add
 from ._base import AbstractHamiltonian, P, Q
 from ._damping import AbstractDamping, move_frame, Scalar, Time
-from ._kinetic import AbstractKinetic, as_kinetic, integrate_velocity
+from ._kinetic import (
+    AbstractKinetic,
+    as_kinetic,
+    integrate_velocity,
+    QuadraticKinetic,
+)
+from ._potential import QuadraticPotential
 
 
 def _check_callable(fn, name: str, signature: str, optional: bool = False):
@@ -80,6 +86,18 @@ class SeparableHamiltonian(AbstractHamiltonian):
     def is_quadratic(self) -> bool:
         return self.velocity_fn is None and self.kinetic.is_quadratic
 
+    @property
+    def has_quadratic_potential(self) -> bool:
+        return self.force_fn is None and isinstance(self.potential, QuadraticPotential)
+
+    @property
+    def has_constant_mass(self) -> bool:
+        return self.velocity_fn is None and isinstance(self.kinetic, QuadraticKinetic)
+
+    def momentum(self, v: Q) -> P:
+        assert isinstance(self.kinetic, QuadraticKinetic)
+        return self.kinetic.momentum(v)
+
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         kinetic = scalar_fn(self.kinetic, "The kinetic energy")(t, p, args)
         potential = scalar_fn(self.potential, "The potential")(t, q, args)
@@ -92,10 +110,14 @@ class SeparableHamiltonian(AbstractHamiltonian):
         return match(self.velocity_fn(t, p, args), p, "`velocity`", "`p`")
 
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
-        if self.force_fn is None:
-            slope = jax.grad(scalar_fn(self.potential, "The potential"), argnums=1)
-            return jtu.tree_map(jnp.negative, slope(t, q, args))
-        return match(self.force_fn(t, q, args), q, "`force`", "`q`")
+        if self.force_fn is not None:
+            return match(self.force_fn(t, q, args), q, "`force`", "`q`")
+        if isinstance(self.potential, QuadraticPotential):
+            slope = self.potential.gradient(q)
+        else:
+            potential = scalar_fn(self.potential, "The potential")
+            slope = jax.grad(potential, argnums=1)(t, q, args)
+        return jtu.tree_map(jnp.negative, slope)
 
     def drift(
         self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8

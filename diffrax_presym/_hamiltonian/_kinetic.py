@@ -5,12 +5,10 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import lineax as lx
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
 from .._misc import (
-    as_parameter,
     as_positive,
     cast_to,
     scalar_fn,
@@ -19,6 +17,7 @@ from .._misc import (
     tree_sum,
 )
 from ._damping import AbstractDamping, gauss_legendre, quadrature, Scalar, Time
+from ._quadratic import as_form, divide, multiply
 
 
 class AbstractKinetic(eqx.Module):
@@ -55,6 +54,9 @@ class AbstractKinetic(eqx.Module):
         r"""The kinetic energy $T_s(p) = e^{-2s} \, T(e^s p)$, without overflow."""
 
 
+_MASS = "`QuadraticKinetic(mass)`"
+
+
 class QuadraticKinetic(AbstractKinetic):
     r"""The kinetic energy $T(p) = \tfrac12 \, p \cdot M^{-1} p$."""
 
@@ -78,9 +80,7 @@ class QuadraticKinetic(AbstractKinetic):
         `ValueError` if a mass is known not to be positive, or if its shape does not fit
         `p` (when the solve is traced).
         """
-        if mass is not None and not isinstance(mass, lx.AbstractLinearOperator):
-            mass = jtu.tree_map(_as_mass, mass)
-        self.mass = mass
+        self.mass = as_form(mass, _MASS, positive=True)
 
     @property
     def is_quadratic(self) -> bool:
@@ -91,21 +91,11 @@ class QuadraticKinetic(AbstractKinetic):
         return energy / 2
 
     def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
-        mass = self.mass
-        if mass is None:
-            return p
-        if isinstance(mass, lx.AbstractLinearOperator):
-            return lx.linear_solve(mass, p, throw=False).value
-        if eqx.is_array(mass):
-            return jtu.tree_map(lambda pi: _divide(pi, mass), p)
-        if jtu.tree_structure(mass) != jtu.tree_structure(p):
-            raise ValueError(
-                "`QuadraticKinetic(mass)` must be one mass, or a pytree of masses of "
-                f"the structure of `p`, {jtu.tree_structure(p)}, but got "
-                f"{jtu.tree_structure(mass)}. A list of numbers for one array `p` is "
-                "`jnp.array(mass)`."
-            )
-        return jtu.tree_map(_divide, p, mass)
+        return divide(self.mass, p, _MASS, "p")
+
+    def momentum(self, v: PyTree) -> PyTree:
+        """The momentum $M v$ of a velocity."""
+        return multiply(self.mass, v, _MASS, "q")
 
     def displacement(self, t, h, p, args, damping, order):
         length = h if damping is None else damping.integral(t, h, order)
@@ -113,41 +103,6 @@ class QuadraticKinetic(AbstractKinetic):
 
     def rescale(self, s: Scalar) -> "QuadraticKinetic":
         return self
-
-
-def _as_mass(mass):
-    name = "`QuadraticKinetic(mass)`"
-    shape = jnp.shape(mass)
-    if len(shape) != 2 or shape[0] != shape[1]:
-        return as_positive(mass, name)
-    # Perhaps a matrix, whose other entries may have any sign.
-    as_positive(jnp.diagonal(mass), f"The diagonal of {name}")
-    return as_parameter(mass, name)
-
-
-def _divide(p, mass):
-    mass = cast_to(mass, p)
-    if mass.ndim == 2 and p.ndim == 1:
-        if mass.shape != (p.size, p.size):
-            raise ValueError(
-                "`QuadraticKinetic(mass)` with a matrix needs one row and column for "
-                f"each entry of `p`, but got shape {mass.shape} for `p` of shape "
-                f"{p.shape}."
-            )
-        operator = lx.MatrixLinearOperator(mass, lx.positive_semidefinite_tag)
-        return lx.linear_solve(operator, p, lx.Cholesky(), throw=False).value
-    fits = mass.ndim == 0 or (
-        mass.ndim == p.ndim
-        and all(m in (1, n) for m, n in zip(mass.shape, p.shape, strict=True))
-    )
-    if not fits:
-        raise ValueError(
-            f"`QuadraticKinetic(mass)` of shape {mass.shape} does not fit `p` of shape "
-            f"{p.shape}. Pass a number, or masses with as many dimensions as `p` that "
-            "broadcast to it, for example `mass[:, None]` for `n` particles with `p` "
-            "of shape `(n, 3)`; or a matrix for a vector `p`."
-        )
-    return p / mass
 
 
 class RelativisticKinetic(AbstractKinetic):

@@ -26,6 +26,7 @@ from ._splitting import (
     BlanesMoanRKN6 as BlanesMoanRKN6,
     Splitting as Splitting,
     Strang as Strang,
+    TunedLinear8 as TunedLinear8,
 )
 from ._tableaus import SplittingTableau as SplittingTableau
 from ._tao import PresymplecticTao as PresymplecticTao

@@ -109,28 +109,29 @@ def _part(y: PyTree, name: str) -> PyTree:
 class _Sums(View):
     """What a scheme sees whose positions and momenta are sums."""
 
+    def values(self, x):
+        return _part(x, "value")
+
     def velocity(self, t, y):
-        return View.velocity(self, t, _part(y, "value"))
+        return View.velocity(self, t, self.values(y))
 
     def force(self, t, y):
-        return View.force(self, t, _part(y, "value"))
+        return View.force(self, t, self.values(y))
 
     def potential_force(self, t, y):
-        return View.potential_force(self, t, _part(y, "value"))
+        return View.potential_force(self, t, self.values(y))
 
-    def move_frame(self, t, h, p):
+    def move_frame(self, t, h, p, share=1):
         damping = self.hamiltonian.damping
         if damping is None:
             return p
         # As an increment, which rounds less than a product.
-        return tree_add(p, jnp.expm1(-damping.increment(t, h)), _part(p, "value"))
+        lost = jnp.expm1(-share * damping.increment(t, h))
+        return tree_add(p, lost, self.values(p))
 
     def drift(self, t, h, y, order):
         # How far `q` moves does not depend on `q`.
         q, p = y
-        zero, momentum = (
-            jax.tree.map(jnp.zeros_like, _part(q, "value")),
-            _part(p, "value"),
-        )
-        moved, _ = View.drift(self, t, h, (zero, momentum), order)
+        zero = jax.tree.map(jnp.zeros_like, self.values(q))
+        moved, _ = View.drift(self, t, h, (zero, self.values(p)), order)
         return tree_add(q, 1, moved), self.move_frame(t, h, p)

@@ -20,7 +20,9 @@ from ._tableaus import (
     BLANES_MOAN_RKN_6,
     SplittingTableau,
     STRANG,
+    TUNED_LINEAR_8,
 )
+from ._variables import Shared, Swapped
 
 
 if TYPE_CHECKING:
@@ -51,13 +53,42 @@ class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
     def order(self, terms):
         return self.tableau.order
 
+    def variables(self, view: View) -> View | Swapped | Shared:
+        """The variables to step in, after a check that this scheme can do the system.
+
+        Mostly those of the state. Where the potential is quadratic instead of the
+        kinetic energy, their roles are swapped.
+        """
+        hamiltonian, name = view.hamiltonian, type(self).__name__
+        if not hamiltonian.is_split:
+            raise ValueError(
+                f"`{name}` needs a Hamiltonian split into a kinetic part and a "
+                f"potential, but this `{type(hamiltonian).__name__}` is not. "
+                "If it is a sum of the two, give its parts: `SeparableHamiltonian("
+                "kinetic, potential)` or `ConformalHamiltonian(kinetic, potential, "
+                "damping)`. For any other use `PresymplecticCoupled()`."
+            )
+        if hamiltonian.is_quadratic or not self.tableau.quadratic:
+            return view
+        if hamiltonian.has_quadratic_potential:
+            return Swapped(view)
+        raise ValueError(
+            f"`{name}` keeps its order only for a kinetic energy quadratic in the "
+            "momentum, and known to be: write it as `QuadraticKinetic(mass)`; or for a "
+            "potential known to be quadratic, `QuadraticPotential(stiffness)`. For any "
+            "other use `BlanesMoan4()` or `BlanesMoan6()`."
+        )
+
     def start(self, view: View, t, y: State):
-        self._check(view)
+        inner = self.variables(view)
         # The force that ends a step starts the next, if the step starts with a kick.
-        return view.potential_force(t, y) if self.tableau.kick_first else None
+        if not self.tableau.kick_first:
+            return None
+        return inner.potential_force(t, inner.enter(t, y))
 
     def advance(self, view: View, t0, t1, h, y: State, carry: PyTree):
-        self._check(view)
+        inner = self.variables(view)
+        y = inner.enter(t0, y)
         fractions = self.tableau.fractions
         kick_first = self.tableau.kick_first
         if kick_first:
@@ -69,8 +100,8 @@ class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
         def stage(state, moves):
             start, end, drift, impulse = moves
             y, _ = state
-            y = view.drift(clock(start), drift * h, y, order)
-            force = view.potential_force(clock(end), y)
+            y = inner.drift(clock(start), drift * h, y, order)
+            force = inner.potential_force(clock(end), y)
             return (kick(y, impulse * h, force), force if kick_first else None), None
 
         table = stage_table(drifts, h)
@@ -78,11 +109,12 @@ class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
         (y, carry), _ = scan_stages(stage, (y, carry), paired)
         if not kick_first:
             start, _, drift = (x[-1] for x in table)
-            y = view.drift(clock(start), drift * h, y, order)
-        return y, carry, None
+            y = inner.drift(clock(start), drift * h, y, order)
+        return inner.leave(t1, y), carry, None
 
     def pull_back(self, view: View, wanted: PyTree, t0, t1, h, end, bar):
-        self._check(view)
+        if self.variables(view) is not view:
+            return super().pull_back(view, wanted, t0, t1, h, end, bar)
         fractions, kick_first = self.tableau.fractions, self.tableau.kick_first
         clock, order = Clock(t0, t1, h), self.tableau.order
         drifts, kicks = fractions[kick_first::2], fractions[1 + kick_first :: 2]
@@ -136,25 +168,10 @@ class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
         return (y, force), gradient, (y_bar, force_bar)
 
     def slope(self, view: View, t, y: State, carry: PyTree) -> State:
-        # What is carried is all of the force only if none of it is kinetic.
-        return view.slope(t, y, force=carry if view.is_separable else None)
-
-    def _check(self, view: View) -> None:
-        name = type(self).__name__
-        if not view.hamiltonian.is_split:
-            raise ValueError(
-                f"`{name}` needs a Hamiltonian split into a kinetic part and a "
-                f"potential, but this `{type(view.hamiltonian).__name__}` is not. "
-                "If it is a sum of the two, give its parts: `SeparableHamiltonian("
-                "kinetic, potential)` or `ConformalHamiltonian(kinetic, potential, "
-                "damping)`. For any other use `PresymplecticCoupled()`."
-            )
-        if self.tableau.quadratic and not view.hamiltonian.is_quadratic:
-            raise ValueError(
-                f"`{name}` keeps its order only for a kinetic energy quadratic in the "
-                "momentum, and known to be: write it as `QuadraticKinetic(mass)`. For "
-                "any other use `BlanesMoan4()` or `BlanesMoan6()`."
-            )
+        # What is carried is all of the force only if none of it is kinetic, and if it
+        # is a force.
+        known = view.is_separable and self.variables(view) is view
+        return view.slope(t, y, force=carry if known else None)
 
 
 class Splitting(AbstractSplitting):
@@ -337,6 +354,43 @@ class BlanesCasasRKN8(AbstractSplitting):
     """
 
     tableau: ClassVar[SplittingTableau] = BLANES_CASAS_RKN_8
+
+
+class TunedLinear8(AbstractSplitting):
+    r"""A splitting for linear forces, with steps of almost a period.
+
+    8th order and symmetric for linear forces and constant friction. Fourteen force
+    evaluations per step. Uses 5th order Hermite interpolation for dense/ts output, at
+    the cost of two more and of two of the derivative of the force along the flow.
+
+    For damped waves, networks of springs, quadratic objectives: anything whose force is
+    linear in the positions, a matrix or a stencil. Per evaluation nothing else here
+    takes steps as long: at step times highest frequency of 0.26 for each evaluation, or
+    3.6 for a step, the error of a step is 1e-9. Its coefficients are tuned for a range
+    of frequencies rather than for ever shorter steps. The friction is split between
+    positions and momenta, $q = e^{-\eta / 2} x$, in which the motion is again that of
+    oscillators, so that constant friction costs no accuracy however strong.
+
+    Of 4th order, and worse than [`diffrax_presym.TunedRKN6`][], where the force is not
+    linear, or it or the friction depends on time. Not for friction $\gamma / t$ from
+    $t = 0$. Such long steps are longer than interpolation can follow: to save at many
+    times, let the steps end there, with `diffrax.StepTo`.
+
+    Its coefficients are of this package: `benchmarks/tuning.py`.
+    """
+
+    tableau: ClassVar[SplittingTableau] = TUNED_LINEAR_8
+
+    def variables(self, view: View) -> Shared:
+        super().variables(view)
+        if not view.hamiltonian.has_constant_mass:
+            raise ValueError(
+                "`TunedLinear8` needs a mass that does not depend on time, and known: "
+                "write `ConformalHamiltonian(QuadraticKinetic(mass), potential, "
+                "damping)` or `SeparableHamiltonian(QuadraticKinetic(mass), "
+                "potential)`. For any other use `TunedRKN6()` or `BlanesMoan6()`."
+            )
+        return Shared(view)
 
 
 def kick(y: State, h, force: PyTree) -> State:

@@ -1,0 +1,352 @@
+"""What is known to be linear or quadratic, and the schemes that make use of it."""
+
+from fractions import Fraction
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import pytest
+from helpers import assert_close, flat, pendulum, solve, step
+
+import diffrax_presym as dps
+
+
+RKN = [dps.BlanesMoanRKN4(), dps.BlanesMoanRKN6(), dps.BlanesCasasRKN8()]
+each_rkn = pytest.mark.parametrize("solver", RKN, ids=lambda s: type(s).__name__)
+Y0 = (jnp.array([1.0, 0.5]), jnp.array([0.3, -0.7]))
+MATRIX = jnp.array([[2.0, -1.0], [-1.0, 3.0]])
+
+
+def end(*args):
+    """The state at the end of a solve."""
+    return jax.tree.map(lambda y: y[-1], solve(*args).ys)
+
+
+def wavy(t):
+    return 0.1 * t + 0.2 * jnp.sin(t)
+
+
+LAWS = {
+    "constant": dps.ConstantDamping(0.3),
+    "log": dps.LogDamping(3.0),
+    "mixed": dps.MixedDamping(0.3, 0.1, 0.5),
+    "function": wavy,
+    "none": None,
+}
+each_law = pytest.mark.parametrize("damping", LAWS.values(), ids=LAWS)
+
+
+# The forms of a stiffness.
+
+
+def diagonal(q):
+    return jnp.array([2.0, 3.0]) * q
+
+
+STIFFNESSES: dict[str, tuple[Any, Any]] = {
+    "none": (None, lambda q: q),
+    "number": (2.0, lambda q: 2 * q),
+    "negative": (-1, lambda q: -q),
+    "vector": (jnp.array([2.0, 3.0]), diagonal),
+    "matrix": (MATRIX, lambda q: MATRIX @ q),
+    "operator": (
+        lx.MatrixLinearOperator(MATRIX, lx.symmetric_tag),
+        lambda q: MATRIX @ q,
+    ),
+}
+
+
+@pytest.mark.parametrize("stiffness, product", STIFFNESSES.values(), ids=STIFFNESSES)
+def test_stiffnesses(stiffness, product):
+    q, p = Y0
+    potential = dps.QuadraticPotential(stiffness)
+    system = dps.SeparableHamiltonian(dps.RelativisticKinetic(), potential)
+    t = jnp.array(0.0)
+    assert_close(potential(t, q), jnp.dot(q, product(q)) / 2, 1e-15)
+    assert_close(system.force(t, q, p), -product(q), 1e-15)
+    assert_close(jax.grad(potential, argnums=1)(t, q, None), product(q), 1e-15)
+
+
+def test_stiffnesses_of_a_pytree():
+    q = {"a": jnp.array([1.0, 2.0]), "b": jnp.array([[3.0]])}
+    potential = dps.QuadraticPotential({"a": MATRIX, "b": 5.0})
+    expected = {"a": MATRIX @ q["a"], "b": jnp.array([[15.0]])}
+    assert_close(potential.gradient(q), expected, 1e-15)
+
+
+@pytest.mark.parametrize(
+    "stiffness, message",
+    [
+        ("stiff", "must be a real number"),
+        (1j, "must be real"),
+        (jnp.ones(3), "does not fit `q` of shape \\(2,\\). Pass a number"),
+        (jnp.ones((3, 3)), "one row and column for each entry of `q`"),
+        ({"a": 1.0}, "a pytree of the structure of `q`"),
+    ],
+)
+def test_stiffnesses_that_do_not_fit(stiffness, message):
+    with pytest.raises(ValueError, match=message):
+        dps.QuadraticPotential(stiffness).gradient(Y0[0])
+
+
+@pytest.mark.parametrize("gamma", [0.0, 1e-9, 1.0, -1.0, -1.0 + 1e-9, 3.0])
+@pytest.mark.parametrize("law", [dps.ConstantDamping, lambda g: dps.LogDamping(g, 1.0)])
+def test_the_response_to_a_force(gamma, law):
+    t, h = jnp.array(2.0), jnp.array(0.3)
+    damping = law(gamma)
+    # That of the base class is a quadrature.
+    expected = dps.AbstractDamping.response(damping, t, h, 16)
+    assert abs(damping.response(t, h, 4) - expected) < 2e-16 * 4
+    slope = jax.grad(lambda gamma: law(gamma).response(t, h, 4))(gamma)
+    e = 1e-5
+    difference = [law(gamma + s * e).response(t, h, 4) for s in (1, -1)]
+    assert abs(slope - (difference[0] - difference[1]) / (2 * e)) < 1e-10
+
+
+def test_the_response_from_the_start_of_friction_that_is_infinite_there():
+    # The momentum is h / (1 + gamma) when a constant force has acted for h.
+    damping, h = dps.LogDamping(3.0), jnp.array(0.5)
+    assert_close(damping.response(jnp.array(0.0), h, 4), h / 4, 1e-15)
+
+
+# Positions and momenta in each other's roles.
+
+
+def quartic(t, p, args):
+    return jnp.sum(p**4) / 4 + (1 + jnp.sin(t) / 3) * jnp.sum(p**2) / 2
+
+
+def swapped(damping, kinetic: Any = quartic):
+    return dps.ConformalHamiltonian(kinetic, dps.QuadraticPotential(MATRIX), damping)
+
+
+@each_rkn
+@each_law
+def test_order_with_swapped_roles(solver, damping):
+    system = swapped(damping)
+    expected = flat(end(system, dfx.Dopri8(), 1.0, 3.0, 1e-3, Y0))
+    order, errors = solver.order(None), []
+    counts = {4: (24, 48), 6: (10, 20), 8: (12, 24)}[order]
+    for n in counts:
+        ys = flat(end(system, solver, 1.0, 3.0, 2 / n, Y0))
+        errors.append(float(jnp.max(jnp.abs(ys - expected))))
+    assert errors[1] < 1e-5
+    assert np.log2(errors[0] / errors[1]) > order - 0.3
+
+
+@each_rkn
+def test_swapped_roles_keep_structure_and_symmetry(solver):
+    damping = dps.LogDamping(1.0)
+    system = swapped(damping)
+    t0, t1 = jnp.array(1.0), jnp.array(1.3)
+
+    def advance(x):
+        return flat(step(system, solver, t0, t1, (x[:2], x[2:]))[0])
+
+    jacobian = jax.jacfwd(advance)(flat(Y0))
+    omega = np.kron([[0, -1], [1, 0]], np.eye(2))
+    contraction = np.exp(-damping.increment(t0, t1 - t0))
+    assert np.max(np.abs(jacobian.T @ omega @ jacobian - contraction * omega)) < 1e-13
+    there = step(system, solver, t0, t1, Y0)[0]
+    assert_close(step(system, solver, t1, t0, there)[0], Y0, 1e-14)
+
+
+def test_swapped_roles_from_the_start_of_friction_that_is_infinite_there():
+    system = swapped(dps.LogDamping(3.0), dps.RelativisticKinetic())
+    y0 = (Y0[0], jnp.zeros(2))
+    rough, fine = (
+        solve(system, dps.BlanesMoanRKN6(), 0.0, 2.0, h, y0).ys for h in (0.1, 0.05)
+    )
+    assert_close(rough, fine, 1e-9)
+
+
+def test_wrappers_around_swapped_roles():
+    system = swapped(dps.ConstantDamping(0.1), dps.RelativisticKinetic())
+    plain = solve(system, dps.BlanesMoanRKN6(), 0.0, 4.0, 0.25, Y0).ys
+    for wrapper in (dps.Compensated, dps.Checked, lambda s: dps.Substeps(s, 1)):
+        ys = solve(system, wrapper(dps.BlanesMoanRKN6()), 0.0, 4.0, 0.25, Y0).ys
+        assert_close(ys, plain, 1e-13)
+
+
+def test_refusal_names_the_quadratic_potential():
+    system = dps.ConformalHamiltonian(dps.RelativisticKinetic(), pendulum, None)
+    with pytest.raises(ValueError, match="`QuadraticPotential\\(stiffness\\)`"):
+        solve(system, dps.BlanesMoanRKN6(), 0.0, 1.0, 0.1, Y0)
+
+
+# Linear forces.
+
+LINEAR = dps.TunedLinear8()
+
+
+def _series(fractions, kick_first, degree):
+    """A step of an oscillator as polynomials in step times frequency, exactly."""
+    one, zero = [Fraction(1)], [Fraction(0)]
+    rows = [[one, zero], [zero, one]]
+    for i, fraction in enumerate(fractions):
+        kick = (i % 2 == 0) == kick_first
+        to, source, sign = (1, 0, -1) if kick else (0, 1, 1)
+        length = sign * Fraction(fraction)
+        for column in (0, 1):
+            moved = [Fraction(0), *(length * x for x in rows[source][column])]
+            old = rows[to][column]
+            size = max(len(old), len(moved))
+            pad = lambda x, size=size: [*x, *[Fraction(0)] * (size - len(x))]
+            rows[to][column] = [
+                x + y for x, y in zip(pad(old), pad(moved), strict=True)
+            ]
+    return [[float(x) for x in entry[:degree]] for row in rows for entry in row]
+
+
+def test_a_step_of_an_oscillator_is_its_rotation_to_eighth_order():
+    tableau = LINEAR.tableau
+    degree, factorial = 9, 1.0
+    cos, sin = np.zeros(degree), np.zeros(degree)
+    for k in range(degree):
+        factorial *= max(k, 1)
+        (cos, sin)[k % 2][k] = (-1) ** (k // 2) / factorial
+    series = _series(tableau.fractions, tableau.kick_first, degree)
+    for computed, exact in zip(series, (cos, sin, -sin, cos), strict=True):
+        padded = [*computed, *[0.0] * (degree - len(computed))]
+        assert np.max(np.abs(padded - exact)) < 1e-15
+
+
+@pytest.mark.parametrize("gamma", [0.0, 0.5, 5.0, -0.1])
+def test_long_steps_of_a_linear_system(gamma):
+    # Frequencies up to where the error of a step was claimed to be 1e-9.
+    omega = jnp.linspace(0.1, 3.6, 50)
+    damping = dps.ConstantDamping(gamma)
+    system = dps.ConformalHamiltonian(
+        dps.QuadraticKinetic(), dps.QuadraticPotential(omega**2), damping
+    )
+    y0 = jnp.ones(50), jnp.zeros(50)
+    shifted = np.sqrt(np.asarray(omega, complex) ** 2 - gamma**2 / 4)
+    steps = 4
+    ys = end(system, LINEAR, 0.0, float(steps), 1.0, y0)
+    decay, phase = np.exp(-gamma * steps / 2), shifted * steps
+    q = decay * (np.cos(phase) + gamma / 2 / shifted * np.sin(phase)).real
+    p = -decay * (np.asarray(omega) ** 2 / shifted * np.sin(phase)).real
+    size = np.maximum(1, np.abs(q)) if gamma < 0 else np.max(np.abs(q))
+    assert np.max(np.abs(ys[0] - q) / size) < steps * 4e-9
+    assert np.max(np.abs(ys[1] - p) / size) < steps * 4e-9 * 3.6
+
+
+MASSES: dict[str, Any] = {
+    "number": 2.0,
+    "vector": jnp.array([1.0, 3.0]),
+    "matrix": jnp.array([[2.0, 0.5], [0.5, 1.0]]),
+    "operator": lx.DiagonalLinearOperator(jnp.array([1.0, 3.0])),
+}
+
+
+@pytest.mark.parametrize("mass", MASSES.values(), ids=MASSES)
+def test_masses_of_linear_systems(mass):
+    system = dps.ConformalHamiltonian(
+        dps.QuadraticKinetic(mass),
+        dps.QuadraticPotential(MATRIX),
+        dps.ConstantDamping(0.8),
+    )
+    expected = solve(system, dfx.Dopri8(), 0.0, 6.0, 1e-2, Y0).ys
+    assert_close(solve(system, LINEAR, 0.0, 6.0, 1.0, Y0).ys, expected, 1e-10)
+
+
+def linear(damping):
+    return dps.ConformalHamiltonian(
+        dps.QuadraticKinetic(jnp.array([1.0, 3.0])),
+        dps.QuadraticPotential(MATRIX),
+        damping,
+    )
+
+
+@each_law
+def test_linear_steps_keep_structure_and_symmetry(damping):
+    system = linear(damping)
+    t0, t1 = jnp.array(1.0), jnp.array(1.6)
+
+    def advance(x):
+        return flat(step(system, LINEAR, t0, t1, (x[:2], x[2:]))[0])
+
+    jacobian = jax.jacfwd(advance)(flat(Y0))
+    omega = np.kron([[0, -1], [1, 0]], np.eye(2))
+    contraction = np.exp(system.log_scale(t0) - system.log_scale(t1))
+    assert np.max(np.abs(jacobian.T @ omega @ jacobian - contraction * omega)) < 1e-13
+    there = step(system, LINEAR, t0, t1, Y0)[0]
+    assert_close(step(system, LINEAR, t1, t0, there)[0], Y0, 1e-14)
+
+
+@each_law
+def test_fourth_order_for_any_other_force_or_friction(damping):
+    system = dps.ConformalHamiltonian(dps.QuadraticKinetic(2.0), pendulum, damping)
+    expected = flat(end(system, dfx.Dopri8(), 1.0, 3.0, 1e-3, Y0))
+    ends = (flat(end(system, LINEAR, 1.0, 3.0, 2 / n, Y0)) for n in (8, 16))
+    errors = [float(jnp.max(jnp.abs(y - expected))) for y in ends]
+    assert errors[1] < 1e-4
+    assert np.log2(errors[0] / errors[1]) > 3.7
+
+
+def test_wrappers_around_linear_steps():
+    system = linear(dps.ConstantDamping(0.1))
+    plain = solve(system, LINEAR, 0.0, 8.0, 1.0, Y0).ys
+    for wrapper in (dps.Compensated, dps.Checked, lambda s: dps.Substeps(s, 1)):
+        assert_close(solve(system, wrapper(LINEAR), 0.0, 8.0, 1.0, Y0).ys, plain, 1e-13)
+
+
+def test_linear_steps_in_float32():
+    system = linear(dps.ConstantDamping(0.1))
+    y0 = tuple(x.astype(jnp.float32) for x in Y0)
+    t0, t1, dt0 = (jnp.array(t, jnp.float32) for t in (0.0, 8.0, 1.0))
+    low = end(system, LINEAR, t0, t1, dt0, y0)
+    assert all(x.dtype == jnp.float32 for x in low)
+    assert_close(low, end(system, LINEAR, 0.0, 8.0, 1.0, Y0), 3e-6)
+
+
+def test_dense_output_of_linear_steps():
+    system = linear(dps.ConstantDamping(0.1))
+    saveat = dfx.SaveAt(ts=jnp.linspace(0, 2, 7))
+    low, high = (
+        solve(system, solver, 0.0, 2.0, h, Y0, saveat=saveat).ys
+        for solver, h in ((LINEAR, 0.1), (dfx.Dopri8(), 0.01))
+    )
+    assert_close(low, high, 1e-7)
+
+
+def test_a_mass_that_depends_on_time_is_refused():
+    damping = dps.ConstantDamping(0.1)
+    system = dps.DissipativeHamiltonian(
+        dps.QuadraticKinetic(), dps.QuadraticPotential(), damping, damping
+    )
+    with pytest.raises(ValueError, match="`ConformalHamiltonian\\(QuadraticKinetic"):
+        solve(system, LINEAR, 0.0, 1.0, 0.5, Y0)
+
+
+@pytest.mark.parametrize(
+    "system, solver",
+    [
+        (swapped(dps.LogDamping(1.0)), dps.BlanesMoanRKN4()),
+        (linear(dps.LogDamping(1.0)), LINEAR),
+        (linear(dps.ConstantDamping(0.3)), LINEAR),
+    ],
+    ids=["swapped", "linear, log", "linear, constant"],
+)
+def test_gradients_by_reversal(system, solver):
+    @eqx.filter_jit
+    def gradient(inputs, adjoint):
+        @eqx.filter_grad
+        def value(inputs):
+            system, y0 = inputs
+            term = dps.HamiltonianTerm(system)
+            sol = dfx.diffeqsolve(
+                term, solver, 1.0, 3.0, 0.25, y0, adjoint=adjoint, max_steps=16
+            )
+            return jnp.sum(flat(sol.ys) ** 2)
+
+        return value(inputs)
+
+    by_reversal = gradient((system, Y0), dps.ReversibleAdjoint())
+    by_checkpoints = gradient((system, Y0), dfx.RecursiveCheckpointAdjoint())
+    assert_close(flat(by_reversal), flat(by_checkpoints), 1e-12)
+    assert jnp.linalg.norm(flat(by_reversal[0])) > 0.1
