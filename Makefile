@@ -14,7 +14,7 @@ PYTEST = -m pytest -q -n $(WORKERS) --dist worksteal
 EXAMPLES := $(sort $(filter-out examples/_%,$(wildcard examples/*.py)))
 # The experiments of the paper share code, so they are run as modules.
 PAPER := $(notdir $(basename $(filter-out examples/paper/_%,$(wildcard examples/paper/*.py))))
-BENCHMARKS := against_loop compile_time schemes work_precision batches nonseparable \
+BENCHMARKS := against_loop compile_time schemes tuning work_precision batches nonseparable \
 	hard_cases gradients
 
 # No window is ever opened: figures go to files.

@@ -22,7 +22,8 @@ class Problem:
     q0: Any
     p0: Any
     t1: float
-    quadratic: bool = True
+    # Whether the force is linear in the positions.
+    linear: bool = False
     # The solution at `t1`, where it is known.
     exact: Callable | None = None
 
@@ -53,12 +54,13 @@ def decaying():
     gamma = 3.0
     return Problem(
         "decaying oscillator",
-        conformal(lambda t, q, args: jnp.sum(q**2) / 2, dps.LogDamping(gamma, 1.0)),
+        conformal(dps.QuadraticPotential(), dps.LogDamping(gamma, 1.0)),
         lambda t, q, p: (p, -q - gamma / (t + 1) * p),
         lambda t, h: gamma * math.log1p(h / (t + 1)),
         np.array([1.0]),
         np.array([0.0]),
         100.0,
+        linear=True,
     )
 
 
@@ -136,7 +138,7 @@ def relativistic():
     return Problem(
         "relativistic oscillator",
         conformal(
-            lambda t, q, args: jnp.sum(q**2) / 2,
+            dps.QuadraticPotential(),
             dps.ConstantDamping(gamma),
             dps.RelativisticKinetic(),
         ),
@@ -145,7 +147,6 @@ def relativistic():
         np.array([2.0]),
         np.array([0.0]),
         100.0,
-        quadratic=False,
     )
 
 
@@ -153,7 +154,6 @@ def random_quadratic(n=1000, m=1250):
     gamma = 0.7
     a = np.random.default_rng(0).standard_normal((m, n)) / math.sqrt(m)
     hessian = a.T @ a
-    matrix = jnp.asarray(hessian)
     t1 = 20.0
 
     def exact():
@@ -170,17 +170,15 @@ def random_quadratic(n=1000, m=1250):
 
     return Problem(
         f"random quadratic, {n}",
-        dps.ConformalHamiltonian(
-            dps.QuadraticKinetic(),
-            lambda t, q, args: q @ (matrix @ q) / 2,
-            dps.ConstantDamping(gamma),
-            force=lambda t, q, args: -(matrix @ q),
+        conformal(
+            dps.QuadraticPotential(jnp.asarray(hessian)), dps.ConstantDamping(gamma)
         ),
         rhs,
         lambda t, h: gamma * h,
         np.ones(n),
         np.zeros(n),
         t1,
+        linear=True,
         exact=exact,
     )
 

@@ -40,6 +40,7 @@ SCHEMES = {
         "SofroniouSpaletta6": (dps.SofroniouSpaletta6(), 13),
         "BlanesMoan6": (dps.BlanesMoan6(), 10),
         "BlanesMoanRKN6": (dps.BlanesMoanRKN6(), 14),
+        "TunedRKN6": (dps.TunedRKN6(), 14),
     },
     8: {
         "SuzukiYoshida(8)": (dps.SuzukiYoshida(8), 27),

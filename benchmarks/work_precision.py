@@ -44,6 +44,8 @@ OURS = {
     "BlanesMoanRKN4": (dps.BlanesMoanRKN4(), 6),
     "BlanesMoanRKN6": (dps.BlanesMoanRKN6(), 14),
     "BlanesCasasRKN8": (dps.BlanesCasasRKN8(), 19),
+    "TunedRKN6": (dps.TunedRKN6(), 14),
+    "TunedLinear8": (dps.TunedLinear8(), 14),
 }
 DIFFRAX = {"Tsit5": dfx.Tsit5(), "Dopri5": dfx.Dopri5(), "Dopri8": dfx.Dopri8()}
 
@@ -110,7 +112,7 @@ def all_runs(problem, quick):
     term = dps.HamiltonianTerm(problem.hamiltonian)
     runs = []
     for name, (solver, stages) in OURS.items():
-        if "RKN" in name and not problem.quadratic:
+        if "Linear" in name and not problem.linear:
             continue
         sweep = [jnp.asarray(n) for n in step_counts(problem, stages, quick)]
         runs.append(("ours", name, constant(problem, term, solver), sweep))

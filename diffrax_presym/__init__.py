@@ -58,6 +58,7 @@ from ._solver import (
     Suzuki4 as Suzuki4,
     SuzukiYoshida as SuzukiYoshida,
     TunedLinear8 as TunedLinear8,
+    TunedRKN6 as TunedRKN6,
 )
 from ._step_density import (
     ArclengthDensity as ArclengthDensity,

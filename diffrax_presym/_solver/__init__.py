@@ -27,6 +27,7 @@ from ._splitting import (
     Splitting as Splitting,
     Strang as Strang,
     TunedLinear8 as TunedLinear8,
+    TunedRKN6 as TunedRKN6,
 )
 from ._tableaus import SplittingTableau as SplittingTableau
 from ._tao import PresymplecticTao as PresymplecticTao
