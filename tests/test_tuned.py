@@ -235,6 +235,18 @@ def test_long_steps_of_a_linear_system(gamma):
     assert np.max(np.abs(ys[1] - p) / size) < steps * 4e-9 * 3.6
 
 
+def test_long_steps_need_the_friction_shared():
+    system = linear(dps.ConstantDamping(0.5))
+    exact = end(system, dfx.Dopri8(), 0.0, 6.0, 1e-2, Y0)
+    errors = [
+        float(
+            jnp.max(jnp.abs(flat(end(system, solver, 0.0, 6.0, 2.0, Y0)) - flat(exact)))
+        )
+        for solver in (LINEAR, dps.Splitting(LINEAR.tableau))
+    ]
+    assert errors[0] < 1e-8 and errors[1] > 100 * errors[0]
+
+
 MASSES: dict[str, Any] = {
     "number": 2.0,
     "vector": jnp.array([1.0, 3.0]),
