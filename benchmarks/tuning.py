@@ -27,7 +27,7 @@ import time
 
 import jax
 import jax.numpy as jnp
-import mpmath
+import mpmath  # pyright: ignore[reportMissingImports]
 import numpy as np
 
 import diffrax_presym as dps
@@ -254,8 +254,42 @@ class LinearProblem(Problem):
             )
             return jnp.concatenate([weight * error for error in errors])
 
-        self.polynomials = polynomials
         super().__init__(conditions, objective)
+
+    def sharpen(self, x):
+        """The polynomials, to the digits that Euclid's algorithm needs, or `None`."""
+        n, k, number = STAGES, self.fixed, mpmath.mpf
+        cos = [number(1) / math.factorial(2 * j) * (-1) ** j for j in range(n + 1)]
+        sin = [number(1) / math.factorial(2 * j + 1) * (-1) ** j for j in range(n + 1)]
+        scale = [number(math.factorial(2 * j)) / 4**j for j in range(2 * n + 1)]
+        ends = n - k, 2 * (n - k)
+        x = [number(float(value)) for value in x]
+        for _ in range(8):
+            known = [number(1)] * k
+            p = _scaled(cos, [1, *known, *x[: ends[0]]])
+            a = _scaled(sin, [*known, *x[ends[0] : ends[1]]])
+            b = _scaled(sin, [*known, *x[ends[1] :]])
+            off = [u + v for u, v in zip(_times(p, p), [0, *_times(a, b)], strict=True)]
+            off = _scaled(scale, off)
+            if max(map(abs, off[1:])) < 1e-40:
+                return p, a, b
+            # How the product changes with each coefficient that is free.
+            columns = [
+                [0] * j + [2 * cos[j] * c for c in p] for j in range(k + 1, n + 1)
+            ]
+            for j in range(k, n):
+                columns.append([0] * (j + 1) + [sin[j] * c for c in b])
+            for j in range(k, n + 1):
+                columns.append([0] * (j + 1) + [sin[j] * c for c in a])
+            rows = range(k + 1, 2 * n + 1)
+            entry = lambda column, i: column[i] if i < len(column) else number(0)
+            matrix = mpmath.matrix(
+                [[entry(column, i) * scale[i] for column in columns] for i in rows]
+            )
+            wanted = mpmath.matrix([-off[i] for i in rows])
+            step = matrix.T * mpmath.lu_solve(matrix * matrix.T, wanted)
+            x = [u + v for u, v in zip(x, step, strict=True)]
+        return None
 
     def start(self, random):
         """Highest coefficients that tend to zero, the lower the faster to one."""
@@ -265,10 +299,20 @@ class LinearProblem(Problem):
         return x * (1 + 0.1 * random.random() * random.standard_normal(x.size))
 
 
+def _scaled(factors, x):
+    return [factor * value for factor, value in zip(factors, x, strict=False)]
+
+
+def _times(x, y):
+    """The product of two polynomials."""
+    product = [mpmath.mpf(0)] * (len(x) + len(y) - 1)
+    for (i, u), (j, v) in itertools.product(enumerate(x), enumerate(y)):
+        product[i + j] += u * v
+    return product
+
+
 def euclid(p, a, b):
     """The kicks and drifts whose step has these polynomials."""
-    tidy = lambda x: [mpmath.mpf(float(c)) for c in x]
-    p, a, b = tidy(p), tidy(a), tidy(b)
     p2, moves = list(p), []
     minus = lambda x, c, y: [u - c * v for u, v in zip(x, y, strict=True)][:-1]
     for _ in range(STAGES):
@@ -282,30 +326,32 @@ def euclid(p, a, b):
 
 def linear_splittings(random):
     """Splittings for oscillators, found from random starts, without end."""
-    problem = LinearProblem()
+    problem, mpmath.mp.dps = LinearProblem(), 50
     while True:
         x, residual = problem.minimise(problem.start(random), 400)
         if x is None:
             continue
-        moves = euclid(*problem.polynomials(x))
-        # Rounding has made nonsense of Euclid's algorithm, or will of the scheme.
-        if np.sum(np.abs(moves)) < 12 and np.max(np.abs(moves - moves[::-1])) < 1e-3:
-            yield (moves + moves[::-1]) / 2, residual
+        polynomials = problem.sharpen(x)
+        if polynomials is None:
+            continue
+        moves = euclid(*polynomials)
+        # Much longer moves would let errors other than an oscillator's grow.
+        if np.sum(np.abs(moves)) < 12:
+            yield moves, residual
 
 
 def nystroem_splittings(random):
     """Splittings of order 6, found from those for oscillators."""
     problem, found = nystroem_problem(), []
     for moves, _ in linear_splittings(random):
-        starts = [coefficients(moves), *(x for _, x in sorted(found)[:4])]
-        for x in starts:
-            noise = random.choice([0, 0.02, 0.1, 0.25]) * random.standard_normal(x.size)
-            x, residual = problem.minimise(x + noise / STAGES, 250)
+        for start in (coefficients(moves), *(x for _, x in found[:4])):
+            size = random.choice([0, 0.02, 0.1, 0.25]) / STAGES
+            noise = size * random.standard_normal(len(start))
+            x, residual = problem.minimise(start + noise, 250)
             if x is not None:
-                found.append((residual, x.tolist()))
-                found = sorted(found)[:8]
+                found.append((residual, x))
                 yield np.asarray(splitting(x)), residual
-        found = [(residual, np.asarray(x)) for residual, x in found]
+        found = sorted(found, key=lambda pair: pair[0])[:8]
 
 
 def describe(name, moves, kick_first):
