@@ -73,7 +73,7 @@ class QuadraticKinetic(AbstractKinetic):
                 `p` of shape `(n, 3)`, pass masses of shape `(n, 1)`.
             - A square matrix, with `p` a vector: symmetric and positive definite.
             - A pytree of the structure of `p`, whose leaves are any of the above.
-            - A [`lineax.AbstractLinearOperator`][] acting on `p`'s space.
+            - A `lineax.AbstractLinearOperator` acting on `p`'s space.
 
         **Raises:**
 

@@ -31,7 +31,7 @@ class QuadraticPotential(eqx.Module):
                 stiffness for each degree of freedom.
             - A symmetric matrix, with `q` a vector.
             - A pytree of the structure of `q`, whose leaves are any of the above.
-            - A symmetric [`lineax.AbstractLinearOperator`][] acting on `q`'s space.
+            - A symmetric `lineax.AbstractLinearOperator` acting on `q`'s space.
 
         **Raises:**
 
