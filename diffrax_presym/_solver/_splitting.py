@@ -365,20 +365,19 @@ class TunedRKN6(AbstractSplitting):
     the flow.
 
     For quadratic kinetic energies, or quadratic potentials. With the same number of
-    evaluations as [`diffrax_presym.BlanesMoanRKN6`][], and about the same error where
-    the force is far from linear, it errs much less where motions oscillate about
-    equilibria, as most do: the first choice from six digits on.
+    evaluations as [`diffrax_presym.BlanesMoanRKN6`][] it errs much less where motions
+    oscillate about equilibria, as most do: the first choice from six digits on.
 
-    Its coefficients are of this package: of all that fulfil the conditions of order 6,
-    they minimise the errors of an oscillator over a range of frequencies, and those of
-    the next order for any force, `benchmarks/tuning.py`.
+    Its coefficients are of this package: they fulfil the conditions of order 6, and
+    make small what errors are left to an oscillator, over a range of frequencies, and
+    at the next order to any force, `benchmarks/tuning.py`.
     """
 
     tableau: ClassVar[SplittingTableau] = TUNED_RKN_6
 
 
 class TunedLinear8(AbstractSplitting):
-    r"""A splitting for linear forces, with steps of almost a period.
+    r"""A splitting for linear forces, with steps of half a period and more.
 
     8th order and symmetric for linear forces and constant friction. Fourteen force
     evaluations per step. Uses 5th order Hermite interpolation for dense/ts output, at
@@ -390,7 +389,8 @@ class TunedLinear8(AbstractSplitting):
     3.6 for a step, the error of a step is 1e-9. Its coefficients are tuned for a range
     of frequencies rather than for ever shorter steps. The friction is split between
     positions and momenta, $q = e^{-\eta / 2} x$, in which the motion is again that of
-    oscillators, so that constant friction costs no accuracy however strong.
+    oscillators, so that constant friction costs no accuracy up to rates of twice the
+    highest frequency.
 
     Of 4th order, and worse than [`diffrax_presym.TunedRKN6`][], where the force is not
     linear, or it or the friction depends on time. Not for friction $\gamma / t$ from
