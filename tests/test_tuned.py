@@ -37,7 +37,13 @@ LAWS = {
     "function": wavy,
     "none": None,
 }
-each_law = pytest.mark.parametrize("damping", LAWS.values(), ids=LAWS)
+each_law = pytest.mark.parametrize(
+    "damping",
+    [
+        pytest.param(law, id=name, marks=() if name == "log" else pytest.mark.slow)
+        for name, law in LAWS.items()
+    ],
+)
 
 
 # The forms of a stiffness.
