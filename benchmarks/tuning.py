@@ -127,9 +127,9 @@ def words(moves, kick_first):
 # Symmetric splittings by their independent coefficients, and the search among them.
 
 
-def splitting(x, stages=STAGES):
+def splitting(x):
     """Kicks and drifts by turns, kicks first, that sum to one each."""
-    kicks, drifts = x[: stages // 2], x[stages // 2 :]
+    kicks, drifts = x[: STAGES // 2], x[STAGES // 2 :]
     middle = 1 - 2 * jnp.sum(kicks, keepdims=True)
     last = 0.5 - jnp.sum(drifts, keepdims=True)
     kicks = jnp.concatenate([kicks, middle, kicks[::-1]])
@@ -138,9 +138,8 @@ def splitting(x, stages=STAGES):
 
 
 def coefficients(moves):
-    stages = len(moves) // 2
     kicks, drifts = moves[0::2], moves[1::2]
-    return np.array([*kicks[: stages // 2], *drifts[: stages // 2 - 1]], float)
+    return np.array([*kicks[: STAGES // 2], *drifts[: STAGES // 2 - 1]], float)
 
 
 class Problem:
@@ -214,6 +213,15 @@ def nystroem_problem(longest=4.0, weight=1e-3):
     return Problem(conditions, objective)
 
 
+def _taylor(one):
+    """The series of cos(z) and sin(z) / z in z^2, and what brings the coefficients of
+    P^2 + s A B to the size of one; in the arithmetic of `one`."""
+    degrees = range(STAGES + 1)
+    cos = [one / math.factorial(2 * j) * (-1) ** j for j in degrees]
+    sin = [one / math.factorial(2 * j + 1) * (-1) ** j for j in degrees]
+    return cos, sin, [one * math.factorial(2 * j) / 4**j for j in range(2 * STAGES + 1)]
+
+
 class LinearProblem(Problem):
     """In terms of the polynomials P, A and B: what they are times those of cos and sin.
 
@@ -224,8 +232,7 @@ class LinearProblem(Problem):
 
     def __init__(self, longest=5.4):
         n, k = STAGES, self.fixed
-        cos = np.array([(-1) ** j / math.factorial(2 * j) for j in range(n + 1)])
-        sin = np.array([(-1) ** j / math.factorial(2 * j + 1) for j in range(n + 1)])
+        cos, sin, scale = map(np.array, _taylor(1.0))
         ones = jnp.ones(k)
 
         def polynomials(x):
@@ -233,8 +240,6 @@ class LinearProblem(Problem):
             p = jnp.concatenate([jnp.ones(k + 1), p]) * cos
             a = jnp.concatenate([ones, a]) * sin[:-1]
             return p, a, jnp.concatenate([ones, b]) * sin
-
-        scale = np.array([math.factorial(2 * j) / 4.0**j for j in range(2 * n + 1)])
 
         def conditions(x):
             p, a, b = polynomials(x)
@@ -259,9 +264,7 @@ class LinearProblem(Problem):
     def sharpen(self, x):
         """The polynomials, to the digits that Euclid's algorithm needs, or `None`."""
         n, k, number = STAGES, self.fixed, mpmath.mpf
-        cos = [number(1) / math.factorial(2 * j) * (-1) ** j for j in range(n + 1)]
-        sin = [number(1) / math.factorial(2 * j + 1) * (-1) ** j for j in range(n + 1)]
-        scale = [number(math.factorial(2 * j)) / 4**j for j in range(2 * n + 1)]
+        cos, sin, scale = _taylor(number(1))
         ends = n - k, 2 * (n - k)
         x = [number(float(value)) for value in x]
         for _ in range(8):

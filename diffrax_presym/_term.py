@@ -120,7 +120,7 @@ class View(eqx.Module):
         return x
 
     def move_frame(self, t, h, p: PyTree, share: float = 1) -> PyTree:
-        """`p` from the frame of `t` to the frame of `t + h`, if all of it is `p`'s."""
+        """`p` from the frame of `t` to the frame of `t + h`, or a share of the way."""
         return move_frame(self.hamiltonian.damping, t, h, p, share)
 
     def enter(self, t, y: State) -> State:

@@ -57,10 +57,14 @@ def test_compositions_agree_with_the_tables_to_the_last_digit(name):
 
 
 @pytest.mark.parametrize("name", NEW)
-def test_coefficients_are_symmetric_and_so_are_the_schemes(name):
-    table = TABLES[name]["coefficients"] if name in TABLES else []
-    assert table == table[::-1]
+def test_schemes_are_symmetric(name):
     assert SCHEMES[name].is_symmetric
+
+
+@pytest.mark.parametrize("name", [name for name in NEW if name in TABLES])
+def test_coefficients_are_symmetric(name):
+    table = TABLES[name]["coefficients"]
+    assert table == table[::-1]
 
 
 # Two nonlinear systems in which everything depends on time.

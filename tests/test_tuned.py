@@ -26,6 +26,18 @@ def end(*args):
     return jax.tree.map(lambda y: y[-1], solve(*args).ys)
 
 
+def distance(x, y):
+    return float(jnp.max(jnp.abs(flat(x) - flat(y))))
+
+
+def check_structure_and_symmetry(system, solver, t0, t1):
+    t0, t1 = jnp.array(t0), jnp.array(t1)
+    term = dps.HamiltonianTerm(system)
+    assert dps.diagnostics.structure_defect(term, solver, t0, t1, Y0) < 1e-13
+    there = step(system, solver, t0, t1, Y0)[0]
+    assert_close(step(system, solver, t1, t0, there)[0], Y0, 1e-14)
+
+
 def wavy(t):
     return 0.1 * t + 0.2 * jnp.sin(t)
 
@@ -134,31 +146,17 @@ def swapped(damping, kinetic: Any = quartic):
 @each_law
 def test_order_with_swapped_roles(solver, damping):
     system = swapped(damping)
-    expected = flat(end(system, dfx.Dopri8(), 1.0, 3.0, 1e-3, Y0))
-    order, errors = solver.order(None), []
+    expected, order = end(system, dfx.Dopri8(), 1.0, 3.0, 1e-3, Y0), solver.order(None)
     counts = {4: (24, 48), 6: (10, 20), 8: (12, 24)}[order]
-    for n in counts:
-        ys = flat(end(system, solver, 1.0, 3.0, 2 / n, Y0))
-        errors.append(float(jnp.max(jnp.abs(ys - expected))))
+    ends = (end(system, solver, 1.0, 3.0, 2 / n, Y0) for n in counts)
+    errors = [distance(y, expected) for y in ends]
     assert errors[1] < 1e-5
     assert np.log2(errors[0] / errors[1]) > order - 0.3
 
 
 @each_rkn
 def test_swapped_roles_keep_structure_and_symmetry(solver):
-    damping = dps.LogDamping(1.0)
-    system = swapped(damping)
-    t0, t1 = jnp.array(1.0), jnp.array(1.3)
-
-    def advance(x):
-        return flat(step(system, solver, t0, t1, (x[:2], x[2:]))[0])
-
-    jacobian = jax.jacfwd(advance)(flat(Y0))
-    omega = np.kron([[0, -1], [1, 0]], np.eye(2))
-    contraction = np.exp(-damping.increment(t0, t1 - t0))
-    assert np.max(np.abs(jacobian.T @ omega @ jacobian - contraction * omega)) < 1e-13
-    there = step(system, solver, t0, t1, Y0)[0]
-    assert_close(step(system, solver, t1, t0, there)[0], Y0, 1e-14)
+    check_structure_and_symmetry(swapped(dps.LogDamping(1.0)), solver, 1.0, 1.3)
 
 
 def test_swapped_roles_from_the_start_of_friction_that_is_infinite_there():
@@ -245,9 +243,7 @@ def test_long_steps_need_the_friction_shared():
     system = linear(dps.ConstantDamping(0.5))
     exact = end(system, dfx.Dopri8(), 0.0, 6.0, 1e-2, Y0)
     errors = [
-        float(
-            jnp.max(jnp.abs(flat(end(system, solver, 0.0, 6.0, 2.0, Y0)) - flat(exact)))
-        )
+        distance(end(system, solver, 0.0, 6.0, 2.0, Y0), exact)
         for solver in (LINEAR, dps.Splitting(LINEAR.tableau))
     ]
     assert errors[0] < 1e-8 and errors[1] > 100 * errors[0]
@@ -282,26 +278,15 @@ def linear(damping):
 
 @each_law
 def test_linear_steps_keep_structure_and_symmetry(damping):
-    system = linear(damping)
-    t0, t1 = jnp.array(1.0), jnp.array(1.6)
-
-    def advance(x):
-        return flat(step(system, LINEAR, t0, t1, (x[:2], x[2:]))[0])
-
-    jacobian = jax.jacfwd(advance)(flat(Y0))
-    omega = np.kron([[0, -1], [1, 0]], np.eye(2))
-    contraction = np.exp(system.log_scale(t0) - system.log_scale(t1))
-    assert np.max(np.abs(jacobian.T @ omega @ jacobian - contraction * omega)) < 1e-13
-    there = step(system, LINEAR, t0, t1, Y0)[0]
-    assert_close(step(system, LINEAR, t1, t0, there)[0], Y0, 1e-14)
+    check_structure_and_symmetry(linear(damping), LINEAR, 1.0, 1.6)
 
 
 @each_law
 def test_fourth_order_for_any_other_force_or_friction(damping):
     system = dps.ConformalHamiltonian(dps.QuadraticKinetic(2.0), pendulum, damping)
-    expected = flat(end(system, dfx.Dopri8(), 1.0, 3.0, 1e-3, Y0))
-    ends = (flat(end(system, LINEAR, 1.0, 3.0, 2 / n, Y0)) for n in (8, 16))
-    errors = [float(jnp.max(jnp.abs(y - expected))) for y in ends]
+    expected = end(system, dfx.Dopri8(), 1.0, 3.0, 1e-3, Y0)
+    ends = (end(system, LINEAR, 1.0, 3.0, 2 / n, Y0) for n in (8, 16))
+    errors = [distance(y, expected) for y in ends]
     assert errors[1] < 1e-4
     assert np.log2(errors[0] / errors[1]) > 3.7
 

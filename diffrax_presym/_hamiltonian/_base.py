@@ -7,6 +7,7 @@ from jaxtyping import Array, Bool, Inexact, PyTree
 
 from .._misc import tree_scale
 from ._damping import AbstractDamping, Scalar, Time
+from ._kinetic import QuadraticKinetic
 
 
 if TYPE_CHECKING:
@@ -68,14 +69,10 @@ class AbstractHamiltonian(eqx.Module):
         return False
 
     @property
-    def has_constant_mass(self) -> bool:
-        """Whether the energy is known to be a sum of `QuadraticKinetic(mass)` and a
-        potential."""
-        return False
-
-    def momentum(self, v: Q) -> P:
-        """The momentum of a velocity, if the mass is constant."""
-        raise NotImplementedError
+    def quadratic_kinetic(self) -> QuadraticKinetic | None:
+        """The kinetic energy, if the energy is known to be the sum of a potential and
+        one with a constant mass."""
+        return None
 
     @abc.abstractmethod
     def drift(

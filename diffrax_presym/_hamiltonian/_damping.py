@@ -39,13 +39,13 @@ class AbstractDamping(eqx.Module):
     def rate(self, t: Time) -> Scalar:
         r"""The rate of damping $\eta'(t)$."""
 
-    @abc.abstractmethod
     def integral(self, t: Time, h: Time, order: int) -> Scalar:
         r"""The integral of $e^{\eta(t) - \eta(s)}$ over $s$ from $t$ to $t + h$.
 
         How far a velocity that is one at $t$, and decays with the frame, carries.
         Exact where the law allows, and otherwise to the given order in `h`.
         """
+        return quadrature(lambda s: jnp.exp(-self.increment(t, s)), h, order)
 
     def response(self, t: Time, h: Time, order: int) -> Scalar:
         r"""The integral of $e^{\eta(s) - \eta(t + h)}$ over $s$ from $t$ to $t + h$.
@@ -128,23 +128,24 @@ class LogDamping(AbstractDamping):
 
     def integral(self, t: Time, h: Time, order: int) -> Scalar:
         # With x = log((s + h) / s) it is s (exp((1 - gamma) x) - 1) / (1 - gamma).
-        since = t + cast_to(self.shift, t)
-        # At the singularity itself all momentum is lost before it carries anywhere.
-        singular = since == 0
-        since = jnp.where(singular, 1, since)
-        growth = jnp.log1p(h / since)
+        singular, since, growth = self._grow(t, h)
         carried = since * growth * _expm1_ratio((1 - cast_to(self.gamma, t)) * growth)
+        # At the singularity itself all momentum is lost before it carries anywhere.
         return jnp.where(singular, 0, carried)
 
     def response(self, t: Time, h: Time, order: int) -> Scalar:
         # With the same x it is (s + h) (1 - exp(-(1 + gamma) x)) / (1 + gamma).
-        since = t + cast_to(self.shift, t)
+        singular, since, growth = self._grow(t, h)
         power = 1 + cast_to(self.gamma, t)
-        singular = since == 0
-        since = jnp.where(singular, 1, since)
-        growth = jnp.log1p(h / since)
         gained = (since + h) * growth * _expm1_ratio(-power * growth)
         return jnp.where(singular, h / jnp.where(singular, power, 1), gained)
+
+    def _grow(self, t, h):
+        """Whether `t` is the singularity, the time since then, and its growth."""
+        since = t + cast_to(self.shift, t)
+        singular = since == 0
+        since = jnp.where(singular, 1, since)
+        return singular, since, jnp.log1p(h / since)
 
 
 class MixedDamping(AbstractDamping):
@@ -186,9 +187,6 @@ class MixedDamping(AbstractDamping):
         gamma1, gamma2, delta = self._parameters(t)
         return gamma1 / t + gamma2 * delta * t ** (delta - 1)
 
-    def integral(self, t: Time, h: Time, order: int) -> Scalar:
-        return quadrature(lambda s: jnp.exp(-self.increment(t, s)), h, order)
-
 
 class CallableDamping(AbstractDamping):
     """Any function `eta(t)` as a damping; its increments are plain differences."""
@@ -204,9 +202,6 @@ class CallableDamping(AbstractDamping):
     def rate(self, t: Time) -> Scalar:
         t = jnp.asarray(t)
         return jax.jvp(self, (t,), (jnp.ones_like(t),))[1]
-
-    def integral(self, t: Time, h: Time, order: int) -> Scalar:
-        return quadrature(lambda s: jnp.exp(-self.increment(t, s)), h, order)
 
 
 def move_frame(

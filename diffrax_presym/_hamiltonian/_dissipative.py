@@ -14,6 +14,7 @@ from ._kinetic import (
     as_kinetic,
     CallableKinetic,
     integrate_velocity,
+    QuadraticKinetic,
 )
 
 
@@ -46,11 +47,8 @@ class _AbstractDamped(AbstractHamiltonian):
         return self.undamped.has_quadratic_potential
 
     @property
-    def has_constant_mass(self) -> bool:
-        return self.undamped.has_constant_mass
-
-    def momentum(self, v: Q) -> P:
-        return self.undamped.momentum(v)
+    def quadratic_kinetic(self) -> QuadraticKinetic | None:
+        return self.undamped.quadratic_kinetic
 
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         return self.undamped.energy(t, q, p, args)

@@ -91,12 +91,10 @@ class SeparableHamiltonian(AbstractHamiltonian):
         return self.force_fn is None and isinstance(self.potential, QuadraticPotential)
 
     @property
-    def has_constant_mass(self) -> bool:
-        return self.velocity_fn is None and isinstance(self.kinetic, QuadraticKinetic)
-
-    def momentum(self, v: Q) -> P:
-        assert isinstance(self.kinetic, QuadraticKinetic)
-        return self.kinetic.momentum(v)
+    def quadratic_kinetic(self) -> QuadraticKinetic | None:
+        if self.velocity_fn is None and isinstance(self.kinetic, QuadraticKinetic):
+            return self.kinetic
+        return None
 
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         kinetic = scalar_fn(self.kinetic, "The kinetic energy")(t, p, args)

@@ -403,15 +403,15 @@ class TunedLinear8(AbstractSplitting):
     tableau: ClassVar[SplittingTableau] = TUNED_LINEAR_8
 
     def variables(self, view: View) -> Shared:
-        super().variables(view)
-        if not view.hamiltonian.has_constant_mass:
+        kinetic = view.hamiltonian.quadratic_kinetic
+        if kinetic is None:
             raise ValueError(
                 "`TunedLinear8` needs a mass that does not depend on time, and known: "
                 "write `ConformalHamiltonian(QuadraticKinetic(mass), potential, "
                 "damping)` or `SeparableHamiltonian(QuadraticKinetic(mass), "
                 "potential)`. For any other use `TunedRKN6()` or `BlanesMoan6()`."
             )
-        return Shared(view)
+        return Shared(view, kinetic)
 
 
 def kick(y: State, h, force: PyTree) -> State:

@@ -9,7 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from .._misc import tree_add
+from .._hamiltonian import QuadraticKinetic
+from .._hamiltonian._damping import add_friction
+from .._misc import tree_add, tree_scale
 from .._term import State, View
 
 
@@ -42,26 +44,27 @@ class Swapped(eqx.Module):
 class Shared(eqx.Module):
     r"""A frame that positions and momenta share, half of the friction each.
 
-    With $x = e^{\eta / 2} q$ friction turns into a stiffness,
-    $M x'' = e^{\eta / 2} F - (\eta'^2 / 4 + \eta'' / 2) M x$ less. The pair is $q$ and
-    $p + \eta' M q / 2$, which is $e^{-\eta / 2}$ times $x$ and $M x'$.
+    With $q = e^{-\eta / 2} x$ friction turns into a force,
+    $M x'' = e^{\eta / 2} F + (\eta'^2 / 4 + \eta'' / 2) M x$. The pair is $q$ and
+    $p + \eta' M q / 2$, which are $e^{-\eta / 2}$ times $x$ and $M x'$.
     """
 
     view: View
+    kinetic: QuadraticKinetic
+
+    def _momentum(self, z: State) -> PyTree:
+        """The momentum of a velocity that equals the position."""
+        return self.kinetic.momentum(self.view.values(z[0]))
+
+    def _tilt(self, t, y: State, share) -> State:
+        damping, momentum = self.view.hamiltonian.damping, self._momentum(y)
+        return y[0], add_friction(damping, t, y[1], tree_scale(share, momentum))
 
     def enter(self, t, y: State) -> State:
-        return self._tilt(t, y, 1 / 2)
+        return self._tilt(t, y, -1 / 2)
 
     def leave(self, t, z: State) -> State:
-        return self._tilt(t, z, -1 / 2)
-
-    def _tilt(self, t, y, share):
-        hamiltonian = self.view.hamiltonian
-        if hamiltonian.damping is None:
-            return y
-        q, p = y
-        rate = share * hamiltonian.damping.rate(t)
-        return q, tree_add(p, rate, hamiltonian.momentum(self.view.values(q)))
+        return self._tilt(t, z, 1 / 2)
 
     def drift(self, t, h, z: State, order: int) -> State:
         q, p = z
@@ -69,10 +72,8 @@ class Shared(eqx.Module):
         return self.view.move_frame(t, h, z, share=1 / 2)
 
     def potential_force(self, t, z: State) -> PyTree:
-        force = self.view.potential_force(t, z)
-        hamiltonian = self.view.hamiltonian
-        if hamiltonian.damping is None:
+        force, damping = self.view.potential_force(t, z), self.view.hamiltonian.damping
+        if damping is None:
             return force
-        rate, bend = jax.jvp(hamiltonian.damping.rate, (t,), (jnp.ones_like(t),))
-        spring = rate**2 / 4 + bend / 2
-        return tree_add(force, spring, hamiltonian.momentum(self.view.values(z[0])))
+        rate, bend = jax.jvp(damping.rate, (t,), (jnp.ones_like(t),))
+        return tree_add(force, rate**2 / 4 + bend / 2, self._momentum(z))
