@@ -260,7 +260,8 @@ class BlanesMoan4(AbstractSplitting):
     Hermite interpolation for dense/ts output, at the cost of two more.
 
     For any Hamiltonian with a kinetic part of known flow, such as a relativistic one.
-    If that is quadratic, [`diffrax_presym.BlanesMoanRKN4`][] is more accurate still.
+    If that or the potential is quadratic, [`diffrax_presym.BlanesMoanRKN4`][] is faster
+    still.
 
     ??? cite "Reference"
 
@@ -288,8 +289,8 @@ class BlanesMoan6(AbstractSplitting):
     interpolation for dense/ts output, at the cost of the force and its derivative along
     the flow at both ends.
 
-    For any Hamiltonian with a kinetic part of known flow. If that is quadratic,
-    [`diffrax_presym.BlanesMoanRKN6`][] is more accurate still.
+    For any Hamiltonian with a kinetic part of known flow. If that or the potential is
+    quadratic, [`diffrax_presym.TunedRKN6`][] is faster still.
 
     Source: Blanes and Moan (2002), see [`diffrax_presym.BlanesMoan4`][].
     """
@@ -303,8 +304,8 @@ class BlanesMoanRKN4(AbstractSplitting):
     4th order and symmetric. Six force evaluations per step. Uses 3rd order Hermite
     interpolation for dense/ts output, at no cost.
 
-    For quadratic kinetic energies only, which it takes advantage of: the first choice
-    for moderate accuracy.
+    For quadratic kinetic energies, or quadratic potentials, which it takes advantage
+    of: the first choice for moderate accuracy.
 
     Source: Blanes and Moan (2002), see [`diffrax_presym.BlanesMoan4`][].
     """
@@ -319,8 +320,8 @@ class BlanesMoanRKN6(AbstractSplitting):
     Hermite interpolation for dense/ts output, at the cost of the force and its
     derivative along the flow at both ends.
 
-    For quadratic kinetic energies only, which it takes advantage of: the first choice
-    for high accuracy.
+    For quadratic kinetic energies, or quadratic potentials, which it takes advantage
+    of. [`diffrax_presym.TunedRKN6`][] is more accurate where motions oscillate.
 
     Source: Blanes and Moan (2002), see [`diffrax_presym.BlanesMoan4`][].
     """
@@ -335,8 +336,8 @@ class BlanesCasasRKN8(AbstractSplitting):
     Hermite interpolation for dense/ts output, at the cost of the force and its
     derivative along the flow at both ends.
 
-    For quadratic kinetic energies only, which it takes advantage of: the first choice
-    towards the limit of `float64`.
+    For quadratic kinetic energies, or quadratic potentials, which it takes advantage
+    of: the first choice towards the limit of `float64`.
 
     ??? cite "Reference"
 

@@ -19,7 +19,7 @@ class SplittingTableau(NamedTuple):
 
     order: int
     kick_first: bool
-    # Whether the order relies on a kinetic energy quadratic in the momentum.
+    # Whether the order relies on a kinetic energy or a potential that is quadratic.
     quadratic: bool
     fractions: tuple[float, ...]
 
