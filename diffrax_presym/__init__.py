@@ -2,15 +2,19 @@
 
 from . import diagnostics as diagnostics
 from ._adjoint import ReversibleAdjoint as ReversibleAdjoint
-from ._hamiltonian import (
+from ._friction import (
     AbstractDamping as AbstractDamping,
+    ConstantDamping as ConstantDamping,
+    LogDamping as LogDamping,
+    MixedDamping as MixedDamping,
+)
+from ._hamiltonian import (
     AbstractHamiltonian as AbstractHamiltonian,
     AbstractKinetic as AbstractKinetic,
     AbstractMirrorMap as AbstractMirrorMap,
     AbstractScaling as AbstractScaling,
     BregmanHamiltonian as BregmanHamiltonian,
     ConformalHamiltonian as ConformalHamiltonian,
-    ConstantDamping as ConstantDamping,
     DissipativeHamiltonian as DissipativeHamiltonian,
     EntropyMirror as EntropyMirror,
     EuclideanMirror as EuclideanMirror,
@@ -18,9 +22,7 @@ from ._hamiltonian import (
     Hamiltonian as Hamiltonian,
     HyperbolicMirror as HyperbolicMirror,
     LogBarrierMirror as LogBarrierMirror,
-    LogDamping as LogDamping,
     MirrorMap as MirrorMap,
-    MixedDamping as MixedDamping,
     PNormMirror as PNormMirror,
     PolynomialScaling as PolynomialScaling,
     QuadraticKinetic as QuadraticKinetic,
@@ -59,6 +61,12 @@ from ._solver import (
     SuzukiYoshida as SuzukiYoshida,
     TunedLinear8 as TunedLinear8,
     TunedRKN6 as TunedRKN6,
+)
+from ._split import (
+    AbstractSplit as AbstractSplit,
+    KineticSplit as KineticSplit,
+    PotentialSplit as PotentialSplit,
+    SharedSplit as SharedSplit,
 )
 from ._step_density import (
     ArclengthDensity as ArclengthDensity,

@@ -1,6 +1,4 @@
-import functools
-from types import CellType, FunctionType
-from typing import Any
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -9,6 +7,13 @@ import jax.tree_util as jtu
 import optimistix as optx
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Inexact, PyTree
+
+
+if TYPE_CHECKING:
+    # To a type checker an abstract field is any kind of field.
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar as AbstractVar
 
 
 def as_parameter(x, name: str) -> Inexact[Array, "..."]:
@@ -22,21 +27,35 @@ def as_parameter(x, name: str) -> Inexact[Array, "..."]:
     return jnp.asarray(x)
 
 
-def as_positive(x, name: str) -> Inexact[Array, "..."]:
-    """As `as_parameter`, and positive, as far as the value is known yet."""
+def as_positive(x, name: str, instead: str = "") -> Inexact[Array, "..."]:
+    """As `as_parameter`, and positive, unless the value is not known yet."""
     x = as_parameter(x, name)
     if not isinstance(x, Tracer) and not bool(jnp.all(x > 0)):
-        raise ValueError(f"{name} must be positive, but got {x}.")
+        raise ValueError(f"{name} must be positive, but got {x}.{instead}")
     return x
 
 
 def cast_to(x: ArrayLike, like: ArrayLike) -> Array:
-    """`x` in the precision of `like`: a parameter never upcasts time or state."""
-    return jnp.asarray(x, jnp.result_type(like))
+    """`x` in the precision of `like`: a parameter never upcasts time or state.
+
+    Nor does an integer, such as a time of `10`, truncate it.
+    """
+    dtype = jnp.result_type(like)
+    return jnp.asarray(x, dtype if jnp.issubdtype(dtype, jnp.inexact) else None)
+
+
+def as_time(t: ArrayLike) -> Array:
+    """A time as a floating-point array."""
+    if jnp.issubdtype(jnp.result_type(t), jnp.inexact):
+        return jnp.asarray(t)
+    return jnp.asarray(t, jnp.result_type(float))
 
 
 class Sum(eqx.Module):
-    """A number, and what rounding has taken from it so far: `value + lost` is meant."""
+    """A number with compensated summation: it stands for `value + lost`.
+
+    `lost` is the rounding error of the additions so far.
+    """
 
     value: Array
     lost: Array
@@ -48,10 +67,20 @@ class Sum(eqx.Module):
         taken = value - self.value
         return Sum(value, (self.value - (value - taken)) + (x - taken))
 
+    def __sub__(self, other: "Sum") -> Array:
+        return (self.value - other.value) + (self.lost - other.lost)
+
+
+_is_sum = lambda x: isinstance(x, Sum)
+
+
+def values(x: PyTree) -> PyTree:
+    """The numbers of a state, without what compensated summation holds besides."""
+    return jtu.tree_map(lambda x: x.value if _is_sum(x) else x, x, is_leaf=_is_sum)
+
 
 def tree_add(y: PyTree, h: ArrayLike, dy: PyTree) -> PyTree:
-    """`y + h * dy`, each leaf in its own precision."""
-    # Each leaf of `y` may be a `Sum`.
+    """`y + h * dy`, each leaf in its own precision. Leaves of `y` may be `Sum`s."""
     add = lambda di, yi: yi + cast_to(h, di) * di
     return jtu.tree_map(add, dy, y)
 
@@ -62,8 +91,8 @@ def tree_sum(x: PyTree, y: PyTree) -> PyTree:
 
 
 def tree_sub(x: PyTree, y: PyTree) -> PyTree:
-    """`x - y`."""
-    return jtu.tree_map(jnp.subtract, x, y)
+    """`x - y`, where both may have `Sum`s for leaves."""
+    return jtu.tree_map(lambda xi, yi: xi - yi, x, y, is_leaf=_is_sum)
 
 
 def tree_scale(c: ArrayLike | None, y: PyTree) -> PyTree:
@@ -151,45 +180,3 @@ def match(value: PyTree, like: PyTree, name: str, like_name: str) -> PyTree:
             ) from e
 
     return jtu.tree_map(leaf, value, like)
-
-
-class _Opened(eqx.Module):
-    """A Python function, and what it closes over as leaves of a pytree."""
-
-    fn: Any = eqx.field(static=True)
-    cells: list
-    defaults: tuple | None
-    keywords: dict | None
-
-    def __call__(self, *args, **kwargs):
-        cells = tuple(map(CellType, self.cells))
-        code, names = self.fn.__code__, self.fn.__globals__
-        fn = FunctionType(code, names, self.fn.__name__, self.defaults, cells)
-        fn.__kwdefaults__ = self.keywords
-        return fn(*args, **kwargs)
-
-
-def opened(tree: PyTree) -> PyTree:
-    """The same, but every array that a function in it closes over is a leaf of it.
-
-    A custom rule for derivatives needs that, and knows of no function what it will be
-    called with, which is what `equinox.filter_closure_convert` would ask for.
-    """
-    return jtu.tree_map(lambda x: _open(x, ()), tree)
-
-
-def _open(x, within: tuple):
-    if isinstance(x, functools.partial):
-        fn, first, known = x.func, x.args, x.keywords
-        x = lambda *args, **kwargs: fn(*first, *args, **(known | kwargs))
-    # A function that closes over itself is left as it is: there is no end to it.
-    if not isinstance(x, FunctionType) or x in within:
-        return x
-    try:
-        cells = [cell.cell_contents for cell in x.__closure__ or ()]
-    except ValueError:  # not yet filled
-        return x
-    inside = cells, x.__defaults__, x.__kwdefaults__
-    inside = jtu.tree_map(lambda leaf: _open(leaf, (*within, x)), inside)
-    # A function is equal to itself alone, so it stays itself where it can.
-    return _Opened(x, *inside) if any(map(eqx.is_array, jtu.tree_leaves(inside))) else x

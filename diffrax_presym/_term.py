@@ -1,23 +1,26 @@
-from typing import Any
-
 import diffrax as dfx
-import equinox as eqx
-import jax
-import jax.numpy as jnp
-import jax.tree_util as jtu
-from jaxtyping import Array, Inexact, PyTree
+from jaxtyping import PyTree
 
 from ._hamiltonian import AbstractHamiltonian
-from ._hamiltonian._damping import add_friction, move_frame
-from ._misc import cast_to, describe, tree_scale
+from ._misc import as_time, tree_scale
+from ._split import State
+from ._system import check_state, System
 
 
-State = tuple[PyTree[Inexact[Array, "..."]], PyTree[Inexact[Array, "..."]]]
-
-
-# Also the closest there is to say of a state at which the energy is not defined. Older
-# versions of Optimistix have no word for it.
-NONFINITE: Any = getattr(dfx.RESULTS, "nonfinite", dfx.RESULTS.nonlinear_divergence)
+# Of Hamiltonians written for earlier versions.
+_SPLITS = (
+    "Write the property `splits`: `(KineticSplit(separable=..., nystrom=...),)` if the "
+    "flow of the kinetic part is known, and `()` otherwise."
+)
+_RENAMED = {
+    "drift": "Write `kinetic_flow(t, h, q, p, args, order)`, which returns the changes "
+    "of `q` and, beyond friction, of `p`. Friction comes from `damping` alone.",
+    "is_separable": _SPLITS,
+    "is_split": _SPLITS,
+    "is_quadratic": _SPLITS,
+    "has_quadratic_potential": _SPLITS,
+    "quadratic_kinetic": _SPLITS,
+}
 
 
 class HamiltonianTerm(dfx.AbstractTerm):
@@ -65,11 +68,17 @@ class HamiltonianTerm(dfx.AbstractTerm):
                 "potential))`, or `HamiltonianTerm(Hamiltonian(energy))` for a "
                 "function `energy(t, q, p, args)`."
             )
+        for name, instead in _RENAMED.items():
+            if hasattr(type(hamiltonian), name):
+                raise ValueError(
+                    f"`{type(hamiltonian).__name__}.{name}` is no longer asked for. "
+                    f"{instead}"
+                )
         self.hamiltonian = hamiltonian
 
     def vf(self, t, y: State, args: PyTree) -> State:
         check_state(y)
-        return View(self.hamiltonian, args, 1).slope(jnp.asarray(t), y)
+        return System(self.hamiltonian, args, 1).slope(as_time(t), y)
 
     def contr(self, t0, t1, **kwargs):
         return t1 - t0
@@ -78,82 +87,15 @@ class HamiltonianTerm(dfx.AbstractTerm):
         return tree_scale(control, vf)
 
 
-class View(eqx.Module):
-    """What a solver sees of a term: velocity, force and frame, in physical time."""
-
-    hamiltonian: AbstractHamiltonian
-    args: PyTree
-    direction: int | Array
-
-    @property
-    def is_separable(self) -> bool:
-        return self.hamiltonian.is_separable
-
-    def time(self, t):
-        """The physical time, which runs backwards where `direction` is -1."""
-        return t * cast_to(self.direction, t)
-
-    def velocity(self, t, y: State):
-        return self.hamiltonian.velocity(t, *y, self.args)
-
-    def check(self, t, y: State) -> dfx.RESULTS | None:
-        """A failure where the energy is not defined."""
-        valid = self.hamiltonian.is_valid(t, *y, self.args)
-        if valid is None:
-            return None
-        return dfx.RESULTS.where(valid, dfx.RESULTS.successful, NONFINITE)
-
-    def force(self, t, y: State):
-        return self._stored(self.hamiltonian.force(t, *y, self.args), t, y)
-
-    def potential_force(self, t, y: State):
-        """The force that a splitting kicks with."""
-        return self._stored(self.hamiltonian.potential_force(t, *y, self.args), t, y)
-
-    def _stored(self, force, t, y: State):
-        # Selecting between two arrays, although always the first, makes XLA store the
-        # force. It would rather recompute an elementwise force wherever it is used.
-        return jtu.tree_map(lambda f, q: jnp.where(t == t, f, q), force, y[0])
-
-    def values(self, x: PyTree) -> PyTree:
-        """The numbers that stand for `x`, here itself."""
-        return x
-
-    def move_frame(self, t, h, p: PyTree, share: float = 1) -> PyTree:
-        """`p` from the frame of `t` to the frame of `t + h`, or a share of the way."""
-        return move_frame(self.hamiltonian.damping, t, h, p, share)
-
-    def enter(self, t, y: State) -> State:
-        """The variables that a splitting steps in, here the state itself."""
-        return y
-
-    def leave(self, t, z: State) -> State:
-        return z
-
-    def drift(self, t, h, y: State, order: int) -> State:
-        """The flow of the kinetic part, frame included."""
-        return self.hamiltonian.drift(t, h, *y, self.args, order)
-
-    def slope(self, t, y: State, force=None) -> State:
-        """The full vector field, of which the force may be known already."""
-        damping = self.hamiltonian.damping
-        force = self.force(t, y) if force is None else force
-        return self.velocity(t, y), add_friction(damping, t, force, y[1])
-
-    def bend(self, t, y: State, slope: State) -> State:
-        """The rate of change of the slope along the flow, the second derivative."""
-        return jax.jvp(self.slope, (t, y), (jnp.ones_like(t), slope))[1]
-
-
-def view(terms: PyTree, args: PyTree) -> View:
-    """The view of the term that `diffeqsolve` hands to a solver."""
+def as_system(terms: PyTree, args: PyTree) -> System:
+    """The system of the term that `diffeqsolve` hands to a solver."""
     term, direction = terms, 1
     # Diffrax wraps a term to solve backwards in time. Its wrapper is private, so it is
     # known here by its two attributes.
     if hasattr(term, "term") and hasattr(term, "direction"):
         term, direction = term.term, term.direction
     if isinstance(term, HamiltonianTerm):
-        return View(term.hamiltonian, args, direction)
+        return System(term.hamiltonian, args, direction)
     if type(term).__name__ == "AdjointTerm":
         raise ValueError(
             "`BacksolveAdjoint()` solves the adjoint equations, which are not "
@@ -167,22 +109,3 @@ def view(terms: PyTree, args: PyTree) -> View:
         "`HamiltonianTerm(VectorField(velocity, force))` for a hand-written vector "
         "field."
     )
-
-
-def check_state(y: PyTree) -> None:
-    wanted = "The state must be a pair `(q, p)` of positions and momenta"
-    if type(y) is not tuple or len(y) != 2:
-        raise ValueError(f"{wanted}, but got {describe(y)}. Write `y0=(q0, p0)`.")
-    q, p = y
-    if describe(q) != describe(p):
-        raise ValueError(
-            f"{wanted} of one structure, shape and precision, but got q of "
-            f"{describe(q)} and p of {describe(p)}."
-        )
-    for leaf in jtu.tree_leaves(y):
-        if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
-            raise ValueError(
-                f"{wanted} in real floating point, but got {describe(q)}. Convert "
-                "them with `jnp.asarray(x, float)`, a complex number to its real and "
-                "imaginary parts."
-            )

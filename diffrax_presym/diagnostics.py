@@ -9,8 +9,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Inexact, PyTree
 
-from ._misc import tree_dot
-from ._term import HamiltonianTerm, State
+from ._misc import as_time, tree_dot
+from ._solver import AbstractPresymplecticSolver
+from ._split import State
+from ._term import HamiltonianTerm
 
 
 Times = Inexact[Array, " times"]
@@ -73,13 +75,14 @@ def energy_error(
         explicit = jax.grad(lambda t: hamiltonian.energy(t, q, p, args))(t)
         if hamiltonian.damping is None:
             return explicit
-        lost = tree_dot(p, hamiltonian.velocity(t, q, p, args))
-        return explicit - hamiltonian.damping.rate(t) * lost
+        velocity = hamiltonian.velocity(t, q, p, args)
+        zero = jax.tree.map(jnp.zeros_like, p)
+        return explicit + tree_dot(hamiltonian.damping.net_force(t, zero, p), velocity)
 
     def with_slope(t, y):
         return jax.jvp(power, (t, y), (jnp.ones_like(t), term.vf(t, y, args)))
 
-    ts = jnp.asarray(ts)
+    ts = as_time(ts)
     values, slopes = _at_each(with_slope, ts, ys)
     # The trapezoidal rule and its first correction.
     h = jnp.diff(ts)
@@ -90,7 +93,7 @@ def energy_error(
 
 
 def _at_each(fn, ts, ys):
-    return eqx.filter_jit(jax.vmap(fn))(jnp.asarray(ts), ys)
+    return eqx.filter_jit(jax.vmap(fn))(as_time(ts), ys)
 
 
 def structure_defect(
@@ -115,7 +118,7 @@ def structure_defect(
     - `y`: the state `(q, p)` at the start.
     - `args`: as in `diffeqsolve`.
     """
-    return _structure_defect(term, solver, jnp.asarray(t0), jnp.asarray(t1), y, args)
+    return _structure_defect(term, solver, as_time(t0), as_time(t1), y, args)
 
 
 @eqx.filter_jit
@@ -200,12 +203,9 @@ def copy_distance(solver, y: State, solver_state) -> Inexact[Array, ""]:
 
     `ValueError` if the solver keeps no copies.
     """
-    # A composition carries what its base does.
-    while hasattr(solver, "base"):
-        solver = solver.base
-    if not hasattr(solver, "distance"):
+    if not isinstance(solver, AbstractPresymplecticSolver):
         raise ValueError(
-            f"`{type(solver).__name__}` keeps no copies of the system, so there is no "
-            "distance between them. Use `PresymplecticCoupled()`, for example."
+            f"`{type(solver).__name__}` is not a solver of this package, and keeps no "
+            "copies of the system. Use `PresymplecticCoupled()`, for example."
         )
     return solver.distance(y, solver_state)

@@ -1,5 +1,6 @@
 """Gradients by running the scheme backwards, against all other ways to get them."""
 
+import functools
 from functools import partial
 from typing import Any
 
@@ -15,7 +16,7 @@ from helpers import assert_close, each, IMPLICIT, mixed_energy, Scheme, SCHEMES
 from jax.flatten_util import ravel_pytree
 
 import diffrax_presym as dps
-from diffrax_presym._adjoint import _clock
+from diffrax_presym._adjoint._backward import clock
 
 
 REVERSIBLE = dps.ReversibleAdjoint()
@@ -190,7 +191,7 @@ def test_steps_are_found_again_to_rounding(t0, t1, dt0, dtype):
     y0 = (jnp.ones(1, dtype), jnp.zeros(1, dtype))
     sol = _saving_steps(t0, t1, dt0, y0)
     n = int(sol.stats["num_steps"])
-    time = _clock(dfx.ConstantStepSize(), t0, t1, dt0)
+    time = clock(dfx.ConstantStepSize(), t0, t1, dt0)
     with jax.numpy_dtype_promotion("standard"):  # as within `diffeqsolve`
         times = jax.vmap(time)(jnp.arange(n + 1))
     ulp = jnp.finfo(dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
@@ -472,3 +473,71 @@ def test_what_is_not_supported_names_what_is(wrong, what):
 def test_bad_options(kwargs):
     with pytest.raises(ValueError, match=next(iter(kwargs))):
         dps.ReversibleAdjoint(**kwargs)
+
+
+# Where functions may hold what is differentiated.
+
+
+class _Callable:
+    """Not a pytree."""
+
+    def __init__(self, k):
+        self.k = k
+
+    def __call__(self, t, q, args):
+        return self.k * jnp.sum(q**2) / 2
+
+    def method(self, t, q, args):
+        return self(t, q, args)
+
+
+HOLDERS = {
+    "closure": lambda k: lambda t, q, args: k * jnp.sum(q**2) / 2,
+    "default": lambda k: lambda t, q, args, k=k: k * jnp.sum(q**2) / 2,
+    "jit": lambda k: jax.jit(lambda t, q, args: k * jnp.sum(q**2) / 2),
+    "checkpoint": lambda k: jax.checkpoint(lambda t, q, args: k * jnp.sum(q**2) / 2),
+    "partial": lambda k: functools.partial(lambda k, t, q, a: k * jnp.sum(q**2) / 2, k),
+    "callable object": _Callable,
+    "bound method": lambda k: _Callable(k).method,
+    "nested": lambda k: jax.jit(jax.checkpoint(_Callable(k).method)),
+}
+
+
+def _held(k, holder, adjoint):
+    hamiltonian = dps.ConformalHamiltonian(
+        dps.QuadraticKinetic(), holder(k), dps.ConstantDamping(0.1)
+    )
+    y0 = (jnp.array([1.0]), jnp.array([0.0]))
+    sol = dfx.diffeqsolve(
+        dps.HamiltonianTerm(hamiltonian),
+        dps.PresymplecticLeapfrog(),
+        *(0.0, 1.0, 0.1, y0),
+        adjoint=adjoint,
+    )
+    assert sol.ys is not None
+    return jnp.sum(sol.ys[0])
+
+
+@pytest.mark.parametrize("holder", HOLDERS.values(), ids=HOLDERS)
+def test_whatever_holds_an_array(holder):
+    by_reversal, by_checkpoints = (
+        jax.value_and_grad(_held)(1.3, holder, adjoint)
+        for adjoint in (dps.ReversibleAdjoint(), dfx.RecursiveCheckpointAdjoint())
+    )
+    np.testing.assert_allclose(by_reversal, by_checkpoints, rtol=1e-13)
+    # Without a gradient too, inside of a transformation or not.
+    np.testing.assert_allclose(
+        _held(1.3, holder, dps.ReversibleAdjoint()), by_reversal[0], rtol=1e-14
+    )
+
+
+def test_what_cannot_be_seen_is_named():
+    class Hidden(eqx.Module):
+        fn: Any = eqx.field(static=True)
+
+        def __call__(self, t, q, args):
+            return self.fn(t, q, args)
+
+    holder = lambda k: Hidden(HOLDERS["closure"](k))
+    with pytest.raises(ValueError, match=r"field of an `equinox.Module` that is not"):
+        jax.grad(_held)(1.3, holder, dps.ReversibleAdjoint())

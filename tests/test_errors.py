@@ -659,7 +659,7 @@ HAMILTONIANS = {
         ),
     ),
     "exact drift of an energy that is not split": (
-        lambda: NONSEPARABLE["damped"].drift(jnp.array(0.0), jnp.array(0.1), *PAIR),
+        lambda: NONSEPARABLE["damped"].kinetic_flow(0.0, 0.1, *PAIR),
         Mistake("`Hamiltonian(energy)`", "not split", "`PresymplecticCoupled()`"),
     ),
 }

@@ -9,7 +9,7 @@ import lineax as lx
 import numpy as np
 import pytest
 import scipy.integrate
-from helpers import assert_close, flat, henon_heiles, mixed_energy
+from helpers import assert_close, drift, flat, henon_heiles, mixed_energy, solve
 
 import diffrax_presym as dps
 
@@ -182,7 +182,7 @@ def test_vector_field_is_hamilton_s_equations(hamiltonian, H):
 
 def test_separability_is_known_from_the_type():
     for name, (hamiltonian, _) in HAMILTONIANS.items():
-        assert hamiltonian.is_separable == ("nonseparable" not in name)
+        assert bool(hamiltonian.splits) == ("nonseparable" not in name)
 
 
 def test_equal_damping_is_conformal():
@@ -408,7 +408,7 @@ def test_a_relativistic_drift_through_friction_that_stops_it(dtype):
         damping = dps.ConstantDamping(gamma)
         system = dps.ConformalHamiltonian(RELATIVISTIC, potential, damping)
         start = jnp.zeros((), dtype)
-        q, _ = system.drift(start, jnp.ones((), dtype), jnp.zeros_like(p), p)
+        q, _ = drift(system, start, jnp.ones((), dtype), jnp.zeros_like(p), p)
         return q
 
     # By nodes that all come too late to see it move.
@@ -422,3 +422,35 @@ def test_a_relativistic_drift_through_friction_that_stops_it(dtype):
     exact = travelled * np.asarray(p) / 0.5
     gamma = jnp.array(0.5, dtype)
     np.testing.assert_allclose(moved(gamma), exact, rtol=1e-6)
+
+
+# Masses that are missing, or of the wrong shape.
+
+
+def test_massless_test_particles_have_a_way():
+    with pytest.raises(ValueError, match="massless test particles"):
+        dps.QuadraticKinetic(jnp.array([1.0, 0.0]))
+    # A body at rest, and a test particle around it.
+    masses = jnp.array([1.0, 0.0])
+
+    def acceleration(t, q, args):
+        apart = q[:, None] - q[None] + jnp.eye(2)[..., None]
+        cubes = jnp.linalg.norm(apart, axis=-1, keepdims=True) ** 3
+        pairs = masses[None, :, None] * (1 - jnp.eye(2))[..., None]
+        return -jnp.sum(pairs * apart / cubes, axis=1)
+
+    system = dps.SeparableHamiltonian(
+        dps.QuadraticKinetic(), lambda t, q, args: jnp.nan, force=acceleration
+    )
+    q0 = jnp.array([[0.0, 0.0], [1.0, 0.0]])
+    v0 = jnp.array([[0.0, 0.0], [0.0, 1.0]])
+    sol = solve(system, dps.TunedRKN6(), 0.0, 2 * np.pi, np.pi / 20, (q0, v0))
+    assert_close(sol.ys[0][-1], q0, 1e-8)
+
+
+def test_a_euclidean_mirror_takes_masses_as_kinetic_energies_do():
+    mass, q = jnp.array([1.0, 2.0]), jnp.ones((2, 3))
+    with jax.numpy_rank_promotion("allow"):
+        for fn in (dps.EuclideanMirror(mass).gradient, dps.EuclideanMirror(mass)):
+            with pytest.raises(ValueError, match="does not fit"):
+                fn(q[:, :2])

@@ -1,11 +1,5 @@
 from ._base import AbstractHamiltonian as AbstractHamiltonian
 from ._bregman import BregmanHamiltonian as BregmanHamiltonian
-from ._damping import (
-    AbstractDamping as AbstractDamping,
-    ConstantDamping as ConstantDamping,
-    LogDamping as LogDamping,
-    MixedDamping as MixedDamping,
-)
 from ._dissipative import (
     ConformalHamiltonian as ConformalHamiltonian,
     DissipativeHamiltonian as DissipativeHamiltonian,

@@ -1,20 +1,13 @@
 import abc
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact, PyTree
 
-from .._misc import tree_scale
-from ._damping import AbstractDamping, Scalar, Time
-from ._kinetic import QuadraticKinetic
-
-
-if TYPE_CHECKING:
-    # To a type checker an abstract field is any kind of field.
-    from typing import ClassVar as AbstractVar
-else:
-    from equinox import AbstractVar
+from .._friction import AbstractDamping
+from .._friction._base import Scalar, Time
+from .._misc import AbstractVar, as_time, tree_scale
+from .._split import AbstractSplit
 
 
 Q = PyTree[Inexact[Array, "..."]]
@@ -35,11 +28,6 @@ class AbstractHamiltonian(eqx.Module):
 
     damping: AbstractVar[AbstractDamping | None]
 
-    @property
-    @abc.abstractmethod
-    def is_separable(self) -> bool:
-        """Whether the velocity does not depend on `q`, nor the force on `p`."""
-
     @abc.abstractmethod
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         """The mechanical energy $E(t, q, p)$, what a physicist calls the energy."""
@@ -54,37 +42,27 @@ class AbstractHamiltonian(eqx.Module):
 
     @property
     @abc.abstractmethod
-    def is_split(self) -> bool:
-        """Whether the energy is a part whose flow is known plus `V(t, q)`."""
+    def splits(self) -> tuple[AbstractSplit, ...]:
+        """The pairs of exact moves that the motion may be made of, the best first.
 
-    @property
-    @abc.abstractmethod
-    def is_quadratic(self) -> bool:
-        """Whether that part is known to be a kinetic energy quadratic in `p`."""
-
-    @property
-    def has_quadratic_potential(self) -> bool:
-        """Whether the energy is known to be a sum of any kinetic energy and a potential
-        quadratic in `q` that does not depend on time."""
-        return False
-
-    @property
-    def quadratic_kinetic(self) -> QuadraticKinetic | None:
-        """The kinetic energy, if the energy is known to be the sum of a potential and
-        one with a constant mass."""
-        return None
+        For example `(KineticSplit(separable=True, nystrom=False),)`; empty if no flow
+        of a part of the energy is known.
+        """
 
     @abc.abstractmethod
-    def drift(
+    def kinetic_flow(
         self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8
-    ) -> tuple[Q, P]:
-        """The flow of the kinetic part from `t` to `t + h`, frame included.
+    ) -> tuple[Q, P | None]:
+        """The flow of the kinetic part from `t` to `t + h`, friction included.
 
-        Exact where it is known in closed form, and else to the given order in `h`.
+        The change of `q`, and that of `p` beyond the friction of `damping`, `None` if
+        there is nothing beyond. Exact where it is known in closed form, and else to the
+        given order in `h`. Asked for by splittings alone, and only if `splits` is not
+        empty.
         """
 
     def potential_force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
-        r"""The force $-\partial V / \partial q$ of the potential part, if split.
+        r"""The force $-\partial V / \partial q$ of the potential part, if there is one.
 
         All of `force`, unless the kinetic part depends on `q` too.
         """
@@ -101,6 +79,7 @@ class AbstractHamiltonian(eqx.Module):
 
     def log_scale(self, t: Time) -> Scalar:
         r"""The log scale $\eta(t)$; 0 for a system without damping."""
+        t = as_time(t)
         return jnp.zeros_like(t) if self.damping is None else self.damping(t)
 
     def canonical(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
@@ -119,5 +98,5 @@ class AbstractHamiltonian(eqx.Module):
         r"""From the canonical momentum to the mechanical, $p = e^{-\eta(t)} P$."""
         return tree_scale(self._scale(t, -1), P)
 
-    def _scale(self, t, sign):
-        return None if self.damping is None else jnp.exp(sign * self.damping(t))
+    def _scale(self, t: Time, sign: int) -> Scalar | None:
+        return None if self.damping is None else jnp.exp(sign * self.log_scale(t))

@@ -3,6 +3,8 @@ from collections.abc import Callable
 import jax
 from jaxtyping import Array, Bool, PyTree
 
+from .._friction import AbstractDamping
+from .._friction._base import Scalar, Time
 from .._misc import (
     all_finite,
     match,
@@ -11,10 +13,11 @@ from .._misc import (
     tree_dot,
     tree_scale,
     tree_sub,
+    tree_sum,
 )
+from .._split import AbstractSplit, KineticSplit
 from ._base import AbstractHamiltonian, P, Q
-from ._damping import _expm1, AbstractDamping, move_frame, Scalar, Time
-from ._energy import _check_callable
+from ._energy import check_callable
 from ._mirror import AbstractMirrorMap
 from ._scaling import AbstractScaling
 
@@ -78,8 +81,8 @@ class BregmanHamiltonian(AbstractHamiltonian):
                 f"{scaling!r}. For functions of your own write "
                 "`Scaling(alpha, beta, gamma, t0=t0, t1=t1)`."
             )
-        _check_callable(objective, "objective", "f(t, q, args)")
-        _check_callable(gradient, "gradient", "gradient(t, q, args)", optional=True)
+        check_callable(objective, "objective", "f(t, q, args)")
+        check_callable(gradient, "gradient", "gradient(t, q, args)", optional=True)
         self.mirror_map = mirror_map
         self.objective = objective
         self.scaling = scaling
@@ -90,16 +93,9 @@ class BregmanHamiltonian(AbstractHamiltonian):
         return self.scaling.gamma
 
     @property
-    def is_separable(self) -> bool:
-        return self.mirror_map.is_quadratic
-
-    @property
-    def is_split(self) -> bool:
-        return True
-
-    @property
-    def is_quadratic(self) -> bool:
-        return self.mirror_map.is_quadratic
+    def splits(self) -> tuple[AbstractSplit, ...]:
+        linear = self.mirror_map.is_quadratic
+        return (KineticSplit(separable=linear, nystrom=linear),)
 
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         h, step = self.mirror_map, self.mirror_map.step(q, p)
@@ -117,12 +113,13 @@ class BregmanHamiltonian(AbstractHamiltonian):
 
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         force = self.potential_force(t, q, p, args)
-        if self.is_separable:
+        if self.mirror_map.is_quadratic:
             return force
         step = self.mirror_map.step(q, p)
-        _, bent = jax.jvp(self.mirror_map.gradient, (q,), (step,))
-        bend = self.mirror_map.project(tree_sub(p, bent))
-        return tree_add(force, self.scaling.rate(t), bend)
+        # The mirror image of q moves by more than p.
+        _, change = jax.jvp(self.mirror_map.gradient, (q,), (step,))
+        kinetic = self.mirror_map.project(tree_sub(p, change))
+        return tree_add(force, self.scaling.rate(t), kinetic)
 
     def potential_force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         if self.gradient_fn is None:
@@ -132,17 +129,16 @@ class BregmanHamiltonian(AbstractHamiltonian):
             slope = match(self.gradient_fn(t, q, args), q, "`gradient`", "`q`")
         return tree_scale(-self.scaling.strength(t), self.mirror_map.project(slope))
 
-    def drift(
+    def kinetic_flow(
         self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8
-    ) -> tuple[Q, P]:
-        progress = -_expm1(-self.damping.increment(t, h))
-        dq = tree_scale(progress, self.mirror_map.step(q, p))
-        p1 = move_frame(self.damping, t, h, p)
-        if not self.is_separable:
-            # The image of q moves by more than the frame makes up for.
-            bent = tree_sub(tree_scale(progress, p), self.mirror_map.change(q, dq))
-            p1 = tree_add(p1, 1, self.mirror_map.project(bent))
-        return tree_add(q, 1, dq), p1
+    ) -> tuple[Q, P | None]:
+        lost = lambda x: self.damping.decay(t, h, x)
+        dq = tree_scale(-1, lost(self.mirror_map.step(q, p)))
+        if self.mirror_map.is_quadratic:
+            return dq, None
+        # The mirror image of q moves by more than friction makes up for.
+        change = tree_sum(self.mirror_map.change(q, dq), lost(p))
+        return dq, self.mirror_map.project(tree_scale(-1, change))
 
     def is_valid(
         self, t: Time, q: Q, p: P, args: PyTree = None

@@ -1,74 +1,25 @@
-from typing import TYPE_CHECKING
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
+from .._friction import AbstractDamping, as_damping
 from .._misc import scalar_fn, tree_scale
-from ._base import AbstractHamiltonian, P, Q
-from ._damping import AbstractDamping, as_damping, Scalar, Time
-from ._energy import check_potential, Hamiltonian, SeparableHamiltonian
+from ._energy import (
+    AbstractMechanicalHamiltonian,
+    check_potential,
+    GeneralEnergy,
+    SeparableEnergy,
+)
 from ._kinetic import (
     AbstractKinetic,
     as_kinetic,
     CallableKinetic,
     integrate_velocity,
-    QuadraticKinetic,
 )
 
 
-if TYPE_CHECKING:
-    # To a type checker an abstract field is any kind of field.
-    from typing import ClassVar as AbstractVar
-else:
-    from equinox import AbstractVar
-
-
-class _AbstractDamped(AbstractHamiltonian):
-    """An undamped Hamiltonian seen from a moving frame."""
-
-    undamped: AbstractVar[SeparableHamiltonian | Hamiltonian]
-
-    @property
-    def is_separable(self) -> bool:
-        return self.undamped.is_separable
-
-    @property
-    def is_split(self) -> bool:
-        return self.undamped.is_split
-
-    @property
-    def is_quadratic(self) -> bool:
-        return self.undamped.is_quadratic
-
-    @property
-    def has_quadratic_potential(self) -> bool:
-        return self.undamped.has_quadratic_potential
-
-    @property
-    def quadratic_kinetic(self) -> QuadraticKinetic | None:
-        return self.undamped.quadratic_kinetic
-
-    def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
-        return self.undamped.energy(t, q, p, args)
-
-    def velocity(self, t: Time, q: Q, p: P, args: PyTree = None) -> Q:
-        return self.undamped.velocity(t, q, p, args)
-
-    def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
-        return self.undamped.force(t, q, p, args)
-
-    def is_valid(self, t, q, p, args=None):
-        return self.undamped.is_valid(t, q, p, args)
-
-    def drift(
-        self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8
-    ) -> tuple[Q, P]:
-        return self.undamped.damped_drift(t, h, q, p, args, order, self.damping)
-
-
-class ConformalHamiltonian(_AbstractDamped):
+class ConformalHamiltonian(AbstractMechanicalHamiltonian):
     r"""Any energy $E$ with friction: $q' = \partial E/\partial p$ and
     $p' = -\partial E/\partial q - \eta'(t) \, p$.
 
@@ -77,7 +28,7 @@ class ConformalHamiltonian(_AbstractDamped):
     $H(t, q, P) = e^{\eta(t)} E(t, q, e^{-\eta(t)} P)$. The energy may depend on time.
     """
 
-    undamped: SeparableHamiltonian | Hamiltonian
+    E: SeparableEnergy | GeneralEnergy
     damping: AbstractDamping | None
 
     def __init__(
@@ -111,11 +62,10 @@ class ConformalHamiltonian(_AbstractDamped):
         `ValueError` if both or neither of the two forms is given, and as the classes
         named above.
         """
-        by_hand = dict(velocity=velocity, force=force)
         if energy is None and kinetic is not None and potential is not None:
-            self.undamped = SeparableHamiltonian(kinetic, potential, **by_hand)
+            self.E = SeparableEnergy(kinetic, potential, velocity, force)
         elif energy is not None and kinetic is None and potential is None:
-            self.undamped = Hamiltonian(energy, **by_hand)
+            self.E = GeneralEnergy(energy, velocity, force)
         else:
             raise ValueError(
                 "`ConformalHamiltonian` needs either `kinetic` and `potential`, or "
@@ -125,7 +75,7 @@ class ConformalHamiltonian(_AbstractDamped):
         self.damping = None if damping is None else as_damping(damping, "`damping`")
 
 
-class DissipativeHamiltonian(_AbstractDamped):
+class DissipativeHamiltonian(AbstractMechanicalHamiltonian):
     r"""The general family
     $H = e^{-\eta_1(t)} T(t, q, P) + e^{\eta_2(t)} f(t, q)$.
 
@@ -142,7 +92,7 @@ class DissipativeHamiltonian(_AbstractDamped):
     overflows in `float32` once $2 \eta_2$ exceeds 88.
     """
 
-    undamped: SeparableHamiltonian | Hamiltonian
+    E: SeparableEnergy | GeneralEnergy
     damping: AbstractDamping | None
 
     def __init__(self, kinetic, potential, eta1, eta2, *, separable=True):
@@ -166,14 +116,14 @@ class DissipativeHamiltonian(_AbstractDamped):
         check_potential(potential)
         if separable:
             kinetic = _ScaledKinetic(as_kinetic(kinetic), eta1, eta2)
-            self.undamped = SeparableHamiltonian(kinetic, potential)
+            self.E = SeparableEnergy(kinetic, potential)
         elif isinstance(kinetic, AbstractKinetic) or not callable(kinetic):
             raise ValueError(
                 "`DissipativeHamiltonian(..., separable=False)` needs `kinetic` to be "
                 f"a function `T(t, q, P, args)`, but got {kinetic!r}."
             )
         else:
-            self.undamped = Hamiltonian(_ScaledEnergy(kinetic, potential, eta1, eta2))
+            self.E = GeneralEnergy(_ScaledEnergy(kinetic, potential, eta1, eta2))
         self.damping = eta2
 
 
@@ -199,9 +149,9 @@ class _ScaledKinetic(AbstractKinetic):
         scale, kinetic = self._parts(t)
         return tree_scale(scale, kinetic.velocity(t, p, args))
 
-    def displacement(self, t, h, p, args, damping, order):
+    def displacement(self, t, h, p, args, friction, order):
         if not self.is_quadratic:
-            return integrate_velocity(self.velocity, t, h, p, args, damping, order)
+            return integrate_velocity(self.velocity, t, h, p, args, friction, order)
         # The decay of exp(eta2 - eta1) and that of the frame, eta2, leave that of eta1.
         scale, kinetic = self._parts(t)
         dq = kinetic.displacement(t, h, p, args, self.eta1, order)

@@ -1,13 +1,16 @@
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import PyTree
+from jaxtyping import Array, Bool, PyTree
 
-from .._misc import all_finite, match, scalar_fn, tree_add
+from .._friction import AbstractDamping
+from .._friction._base import Scalar, Time
+from .._misc import AbstractVar, all_finite, match, scalar_fn
+from .._split import AbstractSplit, KineticSplit, PotentialSplit, SharedSplit
 from ._base import AbstractHamiltonian, P, Q
-from ._damping import AbstractDamping, move_frame, Scalar, Time
 from ._kinetic import (
     AbstractKinetic,
     as_kinetic,
@@ -17,7 +20,7 @@ from ._kinetic import (
 from ._potential import QuadraticPotential
 
 
-def _check_callable(fn, name: str, signature: str, optional: bool = False):
+def check_callable(fn, name: str, signature: str, optional: bool = False):
     if not callable(fn) and not (optional and fn is None):
         raise ValueError(f"`{name}` must be a function `{signature}`, but got {fn!r}.")
 
@@ -32,19 +35,151 @@ def check_potential(potential):
             "that is not separable is passed by name, "
             "`ConformalHamiltonian(energy=energy, damping=damping)`."
         )
-    _check_callable(potential, "potential", "V(t, q, args)")
+    check_callable(potential, "potential", "V(t, q, args)")
 
 
-class SeparableHamiltonian(AbstractHamiltonian):
-    r"""The energy $E = T(t, p) + V(t, q)$, without damping.
-
-    Every scheme of this package is explicit for it. Both parts may depend on time.
-    """
+class SeparableEnergy(eqx.Module):
+    """A sum of a kinetic and a potential energy."""
 
     kinetic: AbstractKinetic
     potential: Callable
     velocity_fn: Callable | None
     force_fn: Callable | None
+
+    def __init__(self, kinetic, potential, velocity=None, force=None):
+        check_potential(potential)
+        check_callable(velocity, "velocity", "velocity(t, p, args)", optional=True)
+        check_callable(force, "force", "force(t, q, args)", optional=True)
+        self.kinetic = as_kinetic(kinetic)
+        self.potential = potential
+        self.velocity_fn = velocity
+        self.force_fn = force
+
+    def __call__(self, t: Time, q: Q, p: P, args: PyTree) -> Scalar:
+        kinetic = scalar_fn(self.kinetic, "The kinetic energy")(t, p, args)
+        potential = scalar_fn(self.potential, "The potential")(t, q, args)
+        with jax.numpy_dtype_promotion("standard"):
+            return kinetic + potential
+
+    def velocity(self, t: Time, q: Q, p: P, args: PyTree) -> Q:
+        return self._velocity(t, p, args)
+
+    def _velocity(self, t: Time, p: P, args: PyTree) -> Q:
+        if self.velocity_fn is None:
+            return self.kinetic.velocity(t, p, args)
+        return match(self.velocity_fn(t, p, args), p, "`velocity`", "`p`")
+
+    def force(self, t: Time, q: Q, p: P, args: PyTree) -> P:
+        if self.force_fn is not None:
+            return match(self.force_fn(t, q, args), q, "`force`", "`q`")
+        if isinstance(self.potential, QuadraticPotential):
+            slope = self.potential.gradient(q)
+        else:
+            potential = scalar_fn(self.potential, "The potential")
+            slope = jax.grad(potential, argnums=1)(t, q, args)
+        return jtu.tree_map(jnp.negative, slope)
+
+    @property
+    def splits(self) -> tuple[AbstractSplit, ...]:
+        kinetic = self.kinetic if self.velocity_fn is None else None
+        nystrom = kinetic is not None and kinetic.is_quadratic
+        splits = [KineticSplit(separable=True, nystrom=nystrom)]
+        if self.force_fn is None and isinstance(self.potential, QuadraticPotential):
+            splits.append(PotentialSplit())
+        # The mass is constant, as it is not for every energy quadratic in `p`.
+        if isinstance(kinetic, QuadraticKinetic):
+            splits.append(SharedSplit(kinetic))
+        return tuple(splits)
+
+    def displacement(self, t: Time, h: Time, p: P, args: PyTree, damping, order) -> Q:
+        if self.velocity_fn is None:
+            return self.kinetic.displacement(t, h, p, args, damping, order)
+        return integrate_velocity(self._velocity, t, h, p, args, damping, order)
+
+    def is_valid(self, q: Q, p: P) -> None:
+        return None
+
+
+class GeneralEnergy(eqx.Module):
+    """Any function of time, positions and momenta."""
+
+    fn: Callable
+    velocity_fn: Callable | None
+    force_fn: Callable | None
+
+    def __init__(self, energy, velocity=None, force=None):
+        check_callable(energy, "energy", "E(t, q, p, args)")
+        check_callable(velocity, "velocity", "velocity(t, q, p, args)", optional=True)
+        check_callable(force, "force", "force(t, q, p, args)", optional=True)
+        self.fn = energy
+        self.velocity_fn = velocity
+        self.force_fn = force
+
+    def __call__(self, t: Time, q: Q, p: P, args: PyTree) -> Scalar:
+        return scalar_fn(self.fn, "The energy")(t, q, p, args)
+
+    def velocity(self, t: Time, q: Q, p: P, args: PyTree) -> Q:
+        if self.velocity_fn is None:
+            return jax.grad(self.__call__, argnums=2)(t, q, p, args)
+        return match(self.velocity_fn(t, q, p, args), p, "`velocity`", "`p`")
+
+    def force(self, t: Time, q: Q, p: P, args: PyTree) -> P:
+        if self.force_fn is None:
+            slope = jax.grad(self.__call__, argnums=1)(t, q, p, args)
+            return jtu.tree_map(jnp.negative, slope)
+        return match(self.force_fn(t, q, p, args), q, "`force`", "`q`")
+
+    @property
+    def splits(self) -> tuple[AbstractSplit, ...]:
+        return ()
+
+    def displacement(self, t: Time, h: Time, p: P, args: PyTree, damping, order) -> Q:
+        raise ValueError(
+            "`Hamiltonian(energy)` has no exact drift, because it is not split into a "
+            "kinetic and a potential part. Write `SeparableHamiltonian(kinetic, "
+            "potential)` if it is, or use a solver such as `PresymplecticCoupled()`."
+        )
+
+    def is_valid(self, q: Q, p: P) -> Bool[Array, ""]:
+        return all_finite((q, p))
+
+
+class AbstractMechanicalHamiltonian(AbstractHamiltonian):
+    """An energy and a law of friction."""
+
+    E: AbstractVar[SeparableEnergy | GeneralEnergy]
+
+    def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
+        return self.E(t, q, p, args)
+
+    def velocity(self, t: Time, q: Q, p: P, args: PyTree = None) -> Q:
+        return self.E.velocity(t, q, p, args)
+
+    def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
+        return self.E.force(t, q, p, args)
+
+    @property
+    def splits(self) -> tuple[AbstractSplit, ...]:
+        return self.E.splits
+
+    def kinetic_flow(
+        self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8
+    ) -> tuple[Q, None]:
+        return self.E.displacement(t, h, p, args, self.damping, order), None
+
+    def is_valid(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> Bool[Array, ""] | None:
+        return self.E.is_valid(q, p)
+
+
+class SeparableHamiltonian(AbstractMechanicalHamiltonian):
+    r"""The energy $E = T(t, p) + V(t, q)$, without damping.
+
+    Every scheme of this package is explicit for it. Both parts may depend on time.
+    """
+
+    E: SeparableEnergy
     damping = None
 
     def __init__(self, kinetic, potential, *, velocity=None, force=None):
@@ -66,73 +201,18 @@ class SeparableHamiltonian(AbstractHamiltonian):
         `ValueError` if any of these is of the wrong kind, and when the solve is traced
         if a function returns values of the wrong shape.
         """
-        check_potential(potential)
-        _check_callable(velocity, "velocity", "velocity(t, p, args)", optional=True)
-        _check_callable(force, "force", "force(t, q, args)", optional=True)
-        self.kinetic = as_kinetic(kinetic)
-        self.potential = potential
-        self.velocity_fn = velocity
-        self.force_fn = force
+        self.E = SeparableEnergy(kinetic, potential, velocity, force)
 
     @property
-    def is_separable(self) -> bool:
-        return True
+    def kinetic(self) -> AbstractKinetic:
+        return self.E.kinetic
 
     @property
-    def is_split(self) -> bool:
-        return True
-
-    @property
-    def is_quadratic(self) -> bool:
-        return self.velocity_fn is None and self.kinetic.is_quadratic
-
-    @property
-    def has_quadratic_potential(self) -> bool:
-        return self.force_fn is None and isinstance(self.potential, QuadraticPotential)
-
-    @property
-    def quadratic_kinetic(self) -> QuadraticKinetic | None:
-        if self.velocity_fn is None and isinstance(self.kinetic, QuadraticKinetic):
-            return self.kinetic
-        return None
-
-    def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
-        kinetic = scalar_fn(self.kinetic, "The kinetic energy")(t, p, args)
-        potential = scalar_fn(self.potential, "The potential")(t, q, args)
-        with jax.numpy_dtype_promotion("standard"):
-            return kinetic + potential
-
-    def velocity(self, t: Time, q: Q, p: P, args: PyTree = None) -> Q:
-        if self.velocity_fn is None:
-            return self.kinetic.velocity(t, p, args)
-        return match(self.velocity_fn(t, p, args), p, "`velocity`", "`p`")
-
-    def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
-        if self.force_fn is not None:
-            return match(self.force_fn(t, q, args), q, "`force`", "`q`")
-        if isinstance(self.potential, QuadraticPotential):
-            slope = self.potential.gradient(q)
-        else:
-            potential = scalar_fn(self.potential, "The potential")
-            slope = jax.grad(potential, argnums=1)(t, q, args)
-        return jtu.tree_map(jnp.negative, slope)
-
-    def drift(
-        self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8
-    ) -> tuple[Q, P]:
-        return self.damped_drift(t, h, q, p, args, order, None)
-
-    def damped_drift(self, t, h, q, p, args, order, damping):
-        """The drift of the same energy in a moving frame."""
-        if self.velocity_fn is None:
-            dq = self.kinetic.displacement(t, h, p, args, damping, order)
-        else:
-            velocity = lambda t, p, args: self.velocity(t, q, p, args)
-            dq = integrate_velocity(velocity, t, h, p, args, damping, order)
-        return tree_add(q, 1, dq), move_frame(damping, t, h, p)
+    def potential(self) -> Callable:
+        return self.E.potential
 
 
-class Hamiltonian(AbstractHamiltonian):
+class Hamiltonian(AbstractMechanicalHamiltonian):
     r"""Any energy $E(t, q, p)$, without damping; not taken to be separable.
 
     Euler and leapfrog are implicit for it and need a root finder;
@@ -141,9 +221,7 @@ class Hamiltonian(AbstractHamiltonian):
     [`diffrax_presym.SeparableHamiltonian`][] instead.
     """
 
-    energy_fn: Callable
-    velocity_fn: Callable | None
-    force_fn: Callable | None
+    E: GeneralEnergy
     damping = None
 
     def __init__(self, energy, *, velocity=None, force=None):
@@ -160,50 +238,4 @@ class Hamiltonian(AbstractHamiltonian):
         `ValueError` if any of these is not a function, and when the solve is traced if
         a function returns values of the wrong shape.
         """
-        _check_callable(energy, "energy", "E(t, q, p, args)")
-        _check_callable(velocity, "velocity", "velocity(t, q, p, args)", optional=True)
-        _check_callable(force, "force", "force(t, q, p, args)", optional=True)
-        self.energy_fn = energy
-        self.velocity_fn = velocity
-        self.force_fn = force
-
-    @property
-    def is_separable(self) -> bool:
-        return False
-
-    @property
-    def is_split(self) -> bool:
-        return False
-
-    @property
-    def is_quadratic(self) -> bool:
-        return False
-
-    def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
-        return scalar_fn(self.energy_fn, "The energy")(t, q, p, args)
-
-    def velocity(self, t: Time, q: Q, p: P, args: PyTree = None) -> Q:
-        if self.velocity_fn is None:
-            return jax.grad(self.energy, argnums=2)(t, q, p, args)
-        return match(self.velocity_fn(t, q, p, args), p, "`velocity`", "`p`")
-
-    def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
-        if self.force_fn is None:
-            slope = jax.grad(self.energy, argnums=1)(t, q, p, args)
-            return jtu.tree_map(jnp.negative, slope)
-        return match(self.force_fn(t, q, p, args), q, "`force`", "`q`")
-
-    def is_valid(self, t, q, p, args=None):
-        return all_finite((q, p))
-
-    def drift(
-        self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8
-    ) -> tuple[Q, P]:
-        return self.damped_drift(t, h, q, p, args, order, None)
-
-    def damped_drift(self, t, h, q, p, args, order, damping):
-        raise ValueError(
-            "`Hamiltonian(energy)` has no exact drift, because it is not split into a "
-            "kinetic and a potential part. Write `SeparableHamiltonian(kinetic, "
-            "potential)` if it is, or use a solver such as `PresymplecticCoupled()`."
-        )
+        self.E = GeneralEnergy(energy, velocity, force)

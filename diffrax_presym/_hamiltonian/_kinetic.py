@@ -4,19 +4,24 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import lineax as lx
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
+from .._friction import AbstractFriction
+from .._friction._base import Scalar, Time
+from .._friction._functions import gauss_legendre, quadrature
 from .._misc import (
     as_positive,
     cast_to,
     scalar_fn,
+    tree_add,
     tree_dot,
     tree_scale,
     tree_sum,
 )
-from ._damping import AbstractDamping, gauss_legendre, quadrature, Scalar, Time
 from ._quadratic import as_form, divide, multiply
 
 
@@ -43,11 +48,11 @@ class AbstractKinetic(eqx.Module):
         h: Time,
         p: PyTree,
         args: PyTree,
-        damping: AbstractDamping | None,
+        friction: AbstractFriction | None,
         order: int,
     ) -> PyTree:
-        """The integral of the velocity from `t` to `t + h`, while `p` is constant but
-        for its frame. Exact where it can be, and else to the given order in `h`."""
+        """The integral of the velocity from `t` to `t + h`, while nothing but friction
+        acts on `p`. Exact where it can be, and else to the given order in `h`."""
 
     @abc.abstractmethod
     def rescale(self, s: Scalar) -> "AbstractKinetic":
@@ -97,9 +102,10 @@ class QuadraticKinetic(AbstractKinetic):
         """The momentum $M v$ of a velocity."""
         return multiply(self.mass, v, _MASS, "q")
 
-    def displacement(self, t, h, p, args, damping, order):
-        length = h if damping is None else damping.integral(t, h, order)
-        return tree_scale(length, self.velocity(t, p, args))
+    def displacement(self, t, h, p, args, friction, order):
+        if friction is None:
+            return tree_scale(h, self.velocity(t, p, args))
+        return self.velocity(t, friction.carry(t, h, p, order), args)
 
     def rescale(self, s: Scalar) -> "QuadraticKinetic":
         return self
@@ -129,47 +135,50 @@ class RelativisticKinetic(AbstractKinetic):
         self.mass = as_positive(mass, "`RelativisticKinetic(mass=...)`")
         self.speed = as_positive(speed, "`RelativisticKinetic(speed=...)`")
 
-    def _squares(self, p):
-        """Those of the momentum and of `m c`."""
-        square = tree_dot(p, p)
-        rest = cast_to(self.mass, square) * cast_to(self.speed, square)
+    def _scaled(self, p):
+        """The momentum and `m c` in units of the largest of them, the squares of both,
+        and the unit. Squares of the numbers themselves would overflow."""
+        sizes = jtu.tree_map(lambda x: jnp.max(jnp.abs(x), initial=0), p)
+        with jax.numpy_dtype_promotion("standard"):
+            unit = jtu.tree_reduce(jnp.maximum, sizes)
+        rest = cast_to(self.mass, unit) * cast_to(self.speed, unit)
         if rest.shape != ():
             raise ValueError(
                 "`RelativisticKinetic` is the energy of one particle with one mass and "
                 f"one speed of light, but these have shape {rest.shape}. For several "
                 "particles write their energy as a function `T(t, p, args)`."
             )
-        return square, rest**2
-
-    def _norm(self, p):
-        square, rest = self._squares(p)
-        return jnp.sqrt(square + rest)
+        unit = jnp.maximum(unit, rest)
+        # Results do not depend on it, and so neither do their derivatives. It is zero
+        # for a mass that underflows, at rest.
+        unit = lax.stop_gradient(jnp.where(unit > 0, unit, 1))
+        p = tree_scale(1 / unit, p)
+        tiny = cast_to(jnp.finfo(unit.dtype).tiny, unit)
+        return p, tree_dot(p, p), jnp.maximum((rest / unit) ** 2, tiny), unit
 
     @property
     def is_quadratic(self) -> bool:
         return False
 
     def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
-        norm = self._norm(p)
-        return cast_to(self.speed, norm) * norm
+        _, square, rest, unit = self._scaled(p)
+        return cast_to(self.speed, unit) * unit * jnp.sqrt(square + rest)
 
     def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
-        norm = self._norm(p)
-        return tree_scale(cast_to(self.speed, norm) / norm, p)
+        p, square, rest, unit = self._scaled(p)
+        return tree_scale(cast_to(self.speed, unit) / jnp.sqrt(square + rest), p)
 
-    def displacement(self, t, h, p, args, damping, order):
-        if damping is None:
+    def displacement(self, t, h, p, args, friction, order):
+        if friction is None:
             return tree_scale(h, self.velocity(t, p, args))
-        square, rest = self._squares(p)
+        p, square, rest, unit = self._scaled(p)
 
         # The momentum keeps its direction, so that only a number has to be integrated.
-        def pace(s):
-            # By e^40 it has stopped, and the square of much more would overflow.
-            increment = jnp.minimum(damping.increment(t, s), 40)
-            growth = cast_to(jnp.exp(increment), square)
-            return 1 / jnp.sqrt(square + rest * growth**2)
+        def speed(s):
+            left = 1 + cast_to(friction.decay(t, s, jnp.ones_like(s)), square)
+            return left / jnp.sqrt(square * left**2 + rest)
 
-        length = cast_to(self.speed, square) * quadrature(pace, h, order)
+        length = cast_to(self.speed, unit) * quadrature(speed, h, order)
         return tree_scale(length, p)
 
     def rescale(self, s: Scalar) -> "RelativisticKinetic":
@@ -193,8 +202,8 @@ class CallableKinetic(AbstractKinetic):
     def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
         return jax.grad(scalar_fn(self.fn, "The kinetic energy"), argnums=1)(t, p, args)
 
-    def displacement(self, t, h, p, args, damping, order):
-        return integrate_velocity(self.velocity, t, h, p, args, damping, order)
+    def displacement(self, t, h, p, args, friction, order):
+        return integrate_velocity(self.velocity, t, h, p, args, friction, order)
 
     def rescale(self, s: Scalar) -> "CallableKinetic":
         def rescaled(t, p, args):
@@ -204,12 +213,12 @@ class CallableKinetic(AbstractKinetic):
         return CallableKinetic(rescaled)
 
 
-def integrate_velocity(velocity, t, h, p, args, damping, order) -> PyTree:
+def integrate_velocity(velocity, t, h, p, args, friction, order) -> PyTree:
     """The displacement by any velocity `velocity(t, p, args)`, by quadrature."""
 
     def term(s, weight):
-        decay = None if damping is None else jnp.exp(-damping.increment(t, s))
-        return tree_scale(weight, velocity(t + s, tree_scale(decay, p), args))
+        left = p if friction is None else tree_add(p, 1, friction.decay(t, s, p))
+        return tree_scale(weight, velocity(t + s, left, args))
 
     # One node after the other: all at once they would take up memory.
     return functools.reduce(tree_sum, map(term, *gauss_legendre(h, order)))

@@ -5,11 +5,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import lineax as lx
 import optimistix as optx
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, PyTree
 
+from .._friction._base import Scalar
 from .._misc import (
     all_finite,
     as_parameter,
@@ -22,7 +22,6 @@ from .._misc import (
     tree_sub,
     tree_sum,
 )
-from ._damping import Scalar
 from ._kinetic import QuadraticKinetic
 
 
@@ -35,9 +34,9 @@ class AbstractMirrorMap(eqx.Module):
     """
 
     @property
-    @abc.abstractmethod
     def is_quadratic(self) -> bool:
         r"""Whether $\nabla h$ is linear."""
+        return False
 
     @abc.abstractmethod
     def __call__(self, q: PyTree) -> Scalar:
@@ -51,22 +50,26 @@ class AbstractMirrorMap(eqx.Module):
     def inverse(self, w: PyTree) -> PyTree:
         r"""The point $\nabla h^*(w)$ with mirror image $w$."""
 
-    @abc.abstractmethod
     def contains(self, q: PyTree) -> Bool[Array, ""]:
         """Whether `q` is inside of the domain. False for anything not finite."""
+        return all_finite(q)
 
-    @abc.abstractmethod
+    # The difference to the image of `q` itself is exact if there is no step, although
+    # `inverse(gradient(q))` may differ from `q` by rounding.
+
     def step(self, q: PyTree, p: PyTree) -> PyTree:
         r"""The mirror step $\nabla h^*(\nabla h(q) + p) - q$; not finite where there is
         none."""
+        image = self.gradient(q)
+        return tree_sub(self.inverse(tree_sum(image, p)), self.inverse(image))
 
-    @abc.abstractmethod
     def change(self, q: PyTree, dq: PyTree) -> PyTree:
         r"""The difference $\nabla h(q + dq) - \nabla h(q)$."""
+        return tree_sub(self.gradient(tree_sum(q, dq)), self.gradient(q))
 
-    @abc.abstractmethod
     def project(self, p: PyTree) -> PyTree:
         """`p` without the part that changes nothing, if there is any."""
+        return p
 
 
 class EuclideanMirror(AbstractMirrorMap):
@@ -99,34 +102,16 @@ class EuclideanMirror(AbstractMirrorMap):
         return tree_dot(q, self.gradient(q)) / 2
 
     def gradient(self, q: PyTree) -> PyTree:
-        mass = self.kinetic.mass
-        if mass is None:
-            return q
-        if isinstance(mass, lx.AbstractLinearOperator):
-            return mass.mv(q)
-        if eqx.is_array(mass):
-            return jtu.tree_map(lambda qi: _multiply(qi, mass), q)
-        return jtu.tree_map(_multiply, q, mass)
+        return self.kinetic.momentum(q)
 
     def inverse(self, w: PyTree) -> PyTree:
         return self.kinetic.velocity(jnp.zeros(()), w)
-
-    def contains(self, q: PyTree) -> Bool[Array, ""]:
-        return all_finite(q)
 
     def step(self, q: PyTree, p: PyTree) -> PyTree:
         return self.inverse(p)
 
     def change(self, q: PyTree, dq: PyTree) -> PyTree:
         return self.gradient(dq)
-
-    def project(self, p: PyTree) -> PyTree:
-        return p
-
-
-def _multiply(q, mass):
-    mass = cast_to(mass, q)
-    return mass @ q if mass.ndim == 2 and q.ndim == 1 else mass * q
 
 
 class EntropyMirror(AbstractMirrorMap):
@@ -148,10 +133,6 @@ class EntropyMirror(AbstractMirrorMap):
             probability simplex. Defaults to `False`, any positive numbers.
         """
         self.simplex = simplex
-
-    @property
-    def is_quadratic(self) -> bool:
-        return False
 
     def __call__(self, q: PyTree) -> Scalar:
         # On the simplex the linear part is a constant, and left away.
@@ -213,10 +194,6 @@ class PNormMirror(AbstractMirrorMap):
                 "square that is not a norm, write `EuclideanMirror(mass)`."
             )
 
-    @property
-    def is_quadratic(self) -> bool:
-        return False
-
     def __call__(self, q: PyTree) -> Scalar:
         return tree_dot(q, self.gradient(q)) / 2
 
@@ -225,18 +202,6 @@ class PNormMirror(AbstractMirrorMap):
 
     def inverse(self, w: PyTree) -> PyTree:
         return _norm_gradient(w, self.exponent / (self.exponent - 1))
-
-    def contains(self, q: PyTree) -> Bool[Array, ""]:
-        return all_finite(q)
-
-    def step(self, q: PyTree, p: PyTree) -> PyTree:
-        return _difference_step(self, q, p)
-
-    def change(self, q: PyTree, dq: PyTree) -> PyTree:
-        return _difference_change(self, q, dq)
-
-    def project(self, p: PyTree) -> PyTree:
-        return p
 
 
 def _norm_gradient(x: PyTree, s: Scalar) -> PyTree:
@@ -266,10 +231,6 @@ class LogBarrierMirror(AbstractMirrorMap):
     them so is part of the domain, and a solve that violates it fails.
     """
 
-    @property
-    def is_quadratic(self) -> bool:
-        return False
-
     def __call__(self, q: PyTree) -> Scalar:
         return -tree_dot(*_ones_and(jtu.tree_map(jnp.log, q)))
 
@@ -288,9 +249,6 @@ class LogBarrierMirror(AbstractMirrorMap):
 
     def change(self, q: PyTree, dq: PyTree) -> PyTree:
         return jtu.tree_map(lambda q, dq: dq / q / (q + dq), q, dq)
-
-    def project(self, p: PyTree) -> PyTree:
-        return p
 
 
 class HyperbolicMirror(AbstractMirrorMap):
@@ -315,10 +273,6 @@ class HyperbolicMirror(AbstractMirrorMap):
         """
         self.scale = as_positive(scale, "`HyperbolicMirror(scale)`")
 
-    @property
-    def is_quadratic(self) -> bool:
-        return False
-
     def _root(self, q):
         return jnp.hypot(q, cast_to(self.scale, q))
 
@@ -340,12 +294,6 @@ class HyperbolicMirror(AbstractMirrorMap):
             return 2 * q * jnp.sinh(p / 2) ** 2 + self._root(q) * jnp.sinh(p)
 
         return jtu.tree_map(leaf, q, p)
-
-    def change(self, q: PyTree, dq: PyTree) -> PyTree:
-        return _difference_change(self, q, dq)
-
-    def project(self, p: PyTree) -> PyTree:
-        return p
 
 
 class MirrorMap(AbstractMirrorMap):
@@ -406,10 +354,6 @@ class MirrorMap(AbstractMirrorMap):
         self.root_finder = root_finder
         self.root_find_max_steps = root_find_max_steps
 
-    @property
-    def is_quadratic(self) -> bool:
-        return False
-
     def __call__(self, q: PyTree) -> Scalar:
         return scalar_fn(self.fn, "The mirror map")(q)
 
@@ -440,30 +384,9 @@ class MirrorMap(AbstractMirrorMap):
 
     def step(self, q: PyTree, p: PyTree) -> PyTree:
         if self.inverse_fn is not None:
-            return _difference_step(self, q, p)
+            return super().step(q, p)
         w = tree_sum(self.gradient(q), p)
         return tree_sub(self._find(w, q), q)
-
-    def change(self, q: PyTree, dq: PyTree) -> PyTree:
-        return _difference_change(self, q, dq)
-
-    def project(self, p: PyTree) -> PyTree:
-        return p
-
-
-# Where nothing better is known. The difference to the image of `q` itself is exact if
-# there is no step, although `inverse(gradient(q))` may differ from `q` by rounding.
-
-
-def _difference_step(mirror_map: AbstractMirrorMap, q: PyTree, p: PyTree) -> PyTree:
-    image = mirror_map.gradient(q)
-    there = mirror_map.inverse(tree_sum(image, p))
-    return tree_sub(there, mirror_map.inverse(image))
-
-
-def _difference_change(mirror_map: AbstractMirrorMap, q: PyTree, dq: PyTree) -> PyTree:
-    there = mirror_map.gradient(tree_sum(q, dq))
-    return tree_sub(there, mirror_map.gradient(q))
 
 
 def _everywhere(condition: Callable, q: PyTree) -> Bool[Array, ""]:

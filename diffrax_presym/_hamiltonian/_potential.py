@@ -2,8 +2,8 @@ import equinox as eqx
 import lineax as lx
 from jaxtyping import Array, Inexact, PyTree
 
+from .._friction._base import Scalar, Time
 from .._misc import tree_dot
-from ._damping import Scalar, Time
 from ._quadratic import as_form, multiply
 
 

@@ -11,6 +11,12 @@ from jaxtyping import PyTree
 from .._misc import as_parameter, as_positive, cast_to
 
 
+_MASSLESS = (
+    " For massless test particles let `p` be the momentum per unit mass: "
+    "`SeparableHamiltonian(QuadraticKinetic(), potential, force=acceleration)`."
+)
+
+
 def as_form(form, name: str, positive: bool):
     """A number, an array, a matrix, a pytree of these, a Lineax operator or `None`."""
     if form is None or isinstance(form, lx.AbstractLinearOperator):
@@ -21,9 +27,9 @@ def as_form(form, name: str, positive: bool):
         if not positive:
             return as_parameter(x, name)
         if len(shape) != 2 or shape[0] != shape[1]:
-            return as_positive(x, name)
+            return as_positive(x, name, _MASSLESS)
         # Perhaps a matrix, whose other entries may have any sign.
-        as_positive(jnp.diagonal(x), f"The diagonal of {name}")
+        as_positive(jnp.diagonal(x), f"The diagonal of {name}", _MASSLESS)
         return as_parameter(x, name)
 
     return jtu.tree_map(leaf, form)

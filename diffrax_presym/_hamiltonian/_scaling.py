@@ -8,15 +8,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool
 
-from .._misc import as_parameter, as_positive, cast_to
-from ._damping import (
-    AbstractDamping,
-    as_damping,
-    ConstantDamping,
-    LogDamping,
-    Scalar,
-    Time,
-)
+from .._friction import AbstractDamping, as_damping, ConstantDamping, LogDamping
+from .._friction._base import Scalar, Time
+from .._misc import as_parameter, as_positive, as_time, cast_to
 
 
 class AbstractScaling(eqx.Module):
@@ -83,6 +77,7 @@ class PolynomialScaling(AbstractScaling):
         return jnp.log(self.rate(t))
 
     def beta(self, t: Time) -> Scalar:
+        t = as_time(t)
         return cast_to(self.c, t) * jnp.log(t) + jnp.log(cast_to(self.C, t))
 
     @property
@@ -90,9 +85,11 @@ class PolynomialScaling(AbstractScaling):
         return LogDamping(self.c)
 
     def rate(self, t: Time) -> Scalar:
+        t = as_time(t)
         return cast_to(self.c, t) / t
 
     def strength(self, t: Time) -> Scalar:
+        t = as_time(t)
         c, C = cast_to(self.c, t), cast_to(self.C, t)
         return c * C * t ** (c - 1)
 
@@ -127,6 +124,7 @@ class ExponentialScaling(AbstractScaling):
         return jnp.log(self.rate(t))
 
     def beta(self, t: Time) -> Scalar:
+        t = as_time(t)
         return cast_to(self.c, t) * t + jnp.log(cast_to(self.C, t))
 
     @property
@@ -134,9 +132,10 @@ class ExponentialScaling(AbstractScaling):
         return ConstantDamping(self.c)
 
     def rate(self, t: Time) -> Scalar:
-        return cast_to(self.c, t)
+        return cast_to(self.c, as_time(t))
 
     def strength(self, t: Time) -> Scalar:
+        t = as_time(t)
         c, C = cast_to(self.c, t), cast_to(self.C, t)
         return c * C * jnp.exp(c * t)
 

@@ -2,10 +2,12 @@ from collections.abc import Callable
 
 from jaxtyping import PyTree
 
-from .._misc import match, tree_add
+from .._friction import AbstractDamping, as_damping
+from .._friction._base import Scalar, Time
+from .._misc import match
+from .._split import AbstractSplit, KineticSplit
 from ._base import AbstractHamiltonian, P, Q
-from ._damping import AbstractDamping, as_damping, move_frame, Scalar, Time
-from ._energy import _check_callable
+from ._energy import check_callable
 from ._kinetic import integrate_velocity
 
 
@@ -39,23 +41,15 @@ class VectorField(AbstractHamiltonian):
         `ValueError` if any of these is not a function, and when the solve is traced if
         a function returns values of the wrong shape. Asking for the energy is an error.
         """
-        _check_callable(velocity, "velocity", "velocity(t, p, args)")
-        _check_callable(force, "force", "force(t, q, args)")
+        check_callable(velocity, "velocity", "velocity(t, p, args)")
+        check_callable(force, "force", "force(t, q, args)")
         self.velocity_fn = velocity
         self.force_fn = force
         self.damping = None if damping is None else as_damping(damping, "`damping`")
 
     @property
-    def is_separable(self) -> bool:
-        return True
-
-    @property
-    def is_split(self) -> bool:
-        return True
-
-    @property
-    def is_quadratic(self) -> bool:
-        return False
+    def splits(self) -> tuple[AbstractSplit, ...]:
+        return (KineticSplit(separable=True, nystrom=False),)
 
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         raise ValueError(
@@ -70,9 +64,8 @@ class VectorField(AbstractHamiltonian):
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         return match(self.force_fn(t, q, args), q, "`force`", "`q`")
 
-    def drift(
+    def kinetic_flow(
         self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8
-    ) -> tuple[Q, P]:
+    ) -> tuple[Q, None]:
         velocity = lambda t, p, args: self.velocity(t, q, p, args)
-        dq = integrate_velocity(velocity, t, h, p, args, self.damping, order)
-        return tree_add(q, 1, dq), move_frame(self.damping, t, h, p)
+        return integrate_velocity(velocity, t, h, p, args, self.damping, order), None

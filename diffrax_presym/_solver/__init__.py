@@ -11,7 +11,7 @@ from ._composition import (
     Suzuki4 as Suzuki4,
     SuzukiYoshida as SuzukiYoshida,
 )
-from ._copies import (
+from ._coupled import (
     PresymplecticCoupled as PresymplecticCoupled,
     PresymplecticProjected as PresymplecticProjected,
 )

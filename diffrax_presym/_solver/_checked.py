@@ -1,12 +1,13 @@
-import diffrax as dfx
 from jaxtyping import PyTree
 
-from .._misc import all_finite
-from .._term import NONFINITE, State, View
-from ._base import AbstractPresymplecticSolver, first_failure
+from .._system import System
+from ._base import AbstractPresymplecticSolver
+from ._engine import Moves, Stages
+from ._moves import check_finite
+from ._wrapper import AbstractWrapper
 
 
-class Checked(AbstractPresymplecticSolver[PyTree]):
+class Checked(AbstractWrapper[PyTree]):
     """Any scheme, whose solve fails at the first step that is not finite.
 
     Order, cost per step and dense/ts output are those of the base. A potential that
@@ -30,27 +31,8 @@ class Checked(AbstractPresymplecticSolver[PyTree]):
 
         `ValueError` if it is not one.
         """
-        if not isinstance(base, AbstractPresymplecticSolver):
-            raise ValueError(
-                "`base` must be a presymplectic solver, for example "
-                f"`PresymplecticLeapfrog()`, but got {base!r}."
-            )
         self.base = base
 
-    @property
-    def is_symmetric(self) -> bool:
-        return self.base.is_symmetric
-
-    def order(self, terms):
-        return self.base.order(terms)
-
-    def start(self, view: View, t, y: State):
-        return self.base.start(view, t, y)
-
-    def advance(self, view: View, t0, t1, h, y: State, carry: PyTree):
-        y, carry, result = self.base.advance(view, t0, t1, h, y, carry)
-        finite = dfx.RESULTS.where(all_finite(y), dfx.RESULTS.successful, NONFINITE)
-        return y, carry, first_failure(result, finite)
-
-    def slope(self, view: View, t, y: State, carry: PyTree) -> State:
-        return self.base.slope(view, t, y, carry)
+    def moves(self, system: System) -> Moves:
+        moves = self.base.moves(system), check_finite
+        return Stages(moves, [(0, 1, 1), (1, 1, 0)])

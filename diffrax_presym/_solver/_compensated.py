@@ -1,14 +1,17 @@
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Inexact, PyTree
 
-from .._misc import as_positive, cast_to, Sum, tree_add
-from .._term import State, View
+from .._misc import as_positive, cast_to, Sum
+from .._split import State
+from .._system import System
 from ._base import AbstractPresymplecticSolver
+from ._engine import Moves, Stages
+from ._moves import to_sums
+from ._wrapper import AbstractWrapper
 
 
-class Compensated(AbstractPresymplecticSolver[tuple[PyTree, State]]):
+class Compensated(AbstractWrapper[PyTree]):
     """Any explicit scheme, with the digits that its sums lose carried along.
 
     Order, structure and dense/ts output are those of the base; no more evaluations.
@@ -54,84 +57,32 @@ class Compensated(AbstractPresymplecticSolver[tuple[PyTree, State]]):
         `ValueError` if `base` is no presymplectic solver or `length` is known not to be
         positive; and when the solve is traced, for Hamiltonians that are not separable.
         """
-        if not isinstance(base, AbstractPresymplecticSolver):
-            raise ValueError(
-                "`base` must be a presymplectic solver, for example "
-                f"`PresymplecticLeapfrog()`, but got {base!r}."
-            )
         self.base = base
         self.length = (
             None if length is None else as_positive(length, "`Compensated(length=...)`")
         )
 
-    @property
-    def is_symmetric(self) -> bool:
-        return self.base.is_symmetric
+    def step_length(self, t0: Array, t1: Array) -> Array:
+        h = t1 - t0
+        if self.length is None:
+            return h
+        length = jnp.copysign(cast_to(self.length, h), h)
+        ulp = jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+        # Steps of another length, halved ones for example, must be told apart from it.
+        nominal = (jnp.abs(h - length) <= 2 * ulp) & (jnp.abs(length) > 8 * ulp)
+        return jnp.where(nominal, length, h)
 
-    def order(self, terms):
-        return self.base.order(terms)
+    def start(self, system: System, t: Array, y: State) -> PyTree:
+        lost = jtu.tree_map(jnp.zeros_like, y)
+        return self.base.start(system, t, jtu.tree_map(Sum, y, lost)), lost
 
-    def start(self, view: View, t, y: State):
-        if not view.is_separable:
-            raise ValueError(
-                "`Compensated` needs a separable Hamiltonian, the sum of kinetic and "
-                f"potential energy, but this `{type(view.hamiltonian).__name__}` is "
-                "not. Use the solver without it."
-            )
-        return self.base.start(view, t, y), jtu.tree_map(jnp.zeros_like, y)
+    def moves(self, system: System) -> Moves:
+        moves = to_sums, self.base.moves(system), to_sums.inverse
+        return Stages(moves, [(0, 0, 0), (0, 1, 1), (1, 1, 0)])
 
-    def advance(self, view: View, t0, t1, h, y: State, carry):
-        carry, lost = carry
-        if self.length is not None:
-            h = _nominal(cast_to(self.length, h), h, t0, t1)
-        sums = _Sums(view.hamiltonian, view.args, view.direction)
-        y, carry, result = self.base.advance(
-            sums, t0, t1, h, jtu.tree_map(Sum, y, lost), carry
-        )
-        return _part(y, "value"), (carry, _part(y, "lost")), result
+    def slope(self, system: System, t: Array, y: State, carry: PyTree) -> State:
+        return self.base.slope(system, t, y, carry[0])
 
-    def slope(self, view: View, t, y: State, carry) -> State:
-        return self.base.slope(view, t, y, carry[0])
-
-
-def _nominal(length, h, t0, t1):
-    """The nominal length, if it is that of the step as far as can be told."""
-    length = jnp.copysign(length, h)
-    ulp = jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
-    return jnp.where(jnp.abs(h - length) <= 2 * ulp, length, h)
-
-
-def _part(y: PyTree, name: str) -> PyTree:
-    is_sum = lambda x: isinstance(x, Sum)
-    return jtu.tree_map(lambda x: getattr(x, name), y, is_leaf=is_sum)
-
-
-class _Sums(View):
-    """What a scheme sees whose positions and momenta are sums."""
-
-    def values(self, x):
-        return _part(x, "value")
-
-    def velocity(self, t, y):
-        return View.velocity(self, t, self.values(y))
-
-    def force(self, t, y):
-        return View.force(self, t, self.values(y))
-
-    def potential_force(self, t, y):
-        return View.potential_force(self, t, self.values(y))
-
-    def move_frame(self, t, h, p, share=1):
-        damping = self.hamiltonian.damping
-        if damping is None:
-            return p
-        # As an increment, which rounds less than a product.
-        lost = jnp.expm1(-share * damping.increment(t, h))
-        return tree_add(p, lost, self.values(p))
-
-    def drift(self, t, h, y, order):
-        # How far `q` moves does not depend on `q`.
-        q, p = y
-        zero = jax.tree.map(jnp.zeros_like, self.values(q))
-        moved, _ = View.drift(self, t, h, (zero, self.values(p)), order)
-        return tree_add(q, 1, moved), self.move_frame(t, h, p)
+    def distance(self, y: State, solver_state: PyTree) -> Array:
+        carry, lost = solver_state
+        return self.base.distance(jtu.tree_map(Sum, y, lost), carry)

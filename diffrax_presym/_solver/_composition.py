@@ -1,19 +1,16 @@
 import math
 from decimal import Decimal, localcontext
-from typing import ClassVar, Literal, TYPE_CHECKING
+from typing import ClassVar, Literal
 
-import diffrax as dfx
 import equinox as eqx
-import jax.numpy as jnp
-import jax.tree_util as jtu
+import numpy as np
 import optimistix as optx
 from jaxtyping import PyTree
 
-from .._misc import tree_sum
-from .._scan import scan_stages
-from .._term import State, View
-from ._base import AbstractPresymplecticSolver, Clock, stage_table
-from ._copies import PresymplecticCoupled
+from .._misc import AbstractVar
+from .._system import System
+from ._base import AbstractPresymplecticSolver
+from ._engine import Moves, Stages
 from ._leapfrog import PresymplecticLeapfrog
 from ._tableaus import (
     CompositionTableau,
@@ -22,115 +19,37 @@ from ._tableaus import (
     SOFRONIOU_SPALETTA_10,
     SUZUKI_4,
 )
-from ._tao import PresymplecticTao
-
-
-if TYPE_CHECKING:
-    # To a type checker an abstract field is any kind of field.
-    from typing import ClassVar as AbstractVar
-else:
-    from equinox import AbstractVar
+from ._wrapper import AbstractWrapper
 
 
 Weights = tuple[float, ...]
 
 
-class AbstractComposition(AbstractPresymplecticSolver[PyTree]):
+class AbstractComposition(AbstractWrapper[PyTree]):
     """One step made of several steps of a base scheme, by fractions that sum to one."""
 
-    base: AbstractVar[AbstractPresymplecticSolver]
     weights: AbstractVar[Weights]
 
     def __check_init__(self):
-        base, weights = self.base, self.weights
-        if not isinstance(base, AbstractPresymplecticSolver):
-            raise ValueError(
-                "`base` must be a presymplectic solver, for example "
-                f"`PresymplecticLeapfrog()`, but got {base!r}."
-            )
-        if len(set(weights)) == 1:
-            return
-        # Steps of unequal length cancel each other's errors only if those are even in
-        # the length of the step.
-        if not base.is_symmetric:
-            raise ValueError(
-                f"Compositions need a symmetric base, which `{type(base).__name__}` is "
-                "not. Compose `PresymplecticLeapfrog()` instead."
-            )
-        while isinstance(base, AbstractComposition):
-            base = base.base
-        if isinstance(base, PresymplecticCoupled):
-            raise ValueError(
-                "`PresymplecticCoupled` composes by itself, and turns its copies only "
-                "after. Write `PresymplecticCoupled(order)`."
-            )
-        if isinstance(base, PresymplecticTao) and base.coupling is None:
-            raise ValueError(
-                "Inside a composition `PresymplecticTao` needs a coupling that does "
-                "not change with the step, or the order is lost. Write "
-                "`PresymplecticTao(coupling)` with a few times the highest frequency "
-                "of the system, or `PresymplecticCoupled(order)`, which needs none."
-            )
+        if len(set(self.weights)) > 1:
+            error = self.base.composition_error()
+            if error is not None:
+                raise ValueError(error)
 
     @property
     def is_symmetric(self) -> bool:
         return self.base.is_symmetric and self.weights == self.weights[::-1]
 
-    @property
-    def reverse(self) -> "AbstractComposition | None":
-        if self.is_symmetric or self.base.reverse is None:
-            return self if self.is_symmetric else None
-        weights = self.weights[::-1]
-        return _Reversed(self.base.reverse, weights, self)
-
-    def start(self, view: View, t, y: State):
-        return self.base.start(view, t, y)
-
-    def advance(self, view: View, t0, t1, h, y: State, carry: PyTree):
-        clock = Clock(t0, t1, h)
-
-        def stage(state, moves):
-            start, end, weight = moves
-            times = clock(start), clock(end), weight * h
-            y, carry, result = self.base.advance(view, *times, *state)
-            return (y, carry), result
-
-        stages = stage_table(self.weights, h)
-        (y, carry), results = scan_stages(stage, (y, carry), stages)
-        if results is not None:
-            # The first stage to fail, or any if none did.
-            failed = jnp.argmax(results != dfx.RESULTS.successful)
-            results = jtu.tree_map(lambda x: x[failed], results)
-        return y, carry, results
-
-    def pull_back(self, view: View, wanted: PyTree, t0, t1, h, end, bar):
-        clock = Clock(t0, t1, h)
-        gradient = jtu.tree_map(jnp.zeros_like, eqx.filter(view, wanted))
-
-        # Stage by stage, so that none is run more often than it must be.
-        def stage(state, moves):
-            end, bar, gradient = state
-            t0, t1, weight = moves
-            times = clock(t0), clock(t1), weight * h
-            end, more, bar = self.base.pull_back(view, wanted, *times, end, bar)
-            return (end, bar, tree_sum(gradient, more)), None
-
-        stages = stage_table(self.weights, h)
-        state = (end, bar, gradient)
-        (start, bar, gradient), _ = scan_stages(stage, state, stages, reverse=True)
-        return start, gradient, bar
-
-    def slope(self, view: View, t, y: State, carry: PyTree) -> State:
-        return self.base.slope(view, t, y, carry)
+    def moves(self, system: System) -> Moves:
+        return Stages([self.base.moves(system)], rows(self.weights))
 
 
-class _Reversed(AbstractComposition):
-    base: AbstractPresymplecticSolver
-    weights: Weights = eqx.field(static=True)
-    original: AbstractComposition
-
-    def order(self, terms):
-        return self.original.order(terms)
+def rows(weights: Weights) -> np.ndarray:
+    """Where steps of these lengths start and end, and their lengths."""
+    ends = np.cumsum(weights)
+    ends[-1] = 1
+    starts = np.concatenate([[0], ends[:-1]])
+    return np.stack([starts, ends, weights], axis=-1)
 
 
 class Composition(AbstractComposition):
@@ -174,7 +93,7 @@ class Composition(AbstractComposition):
         self.weights = weights
         self.composed_order = order
 
-    def order(self, terms):
+    def order(self, terms) -> int:
         if self.composed_order is None:
             return self.base.order(terms)
         return self.composed_order
@@ -249,7 +168,7 @@ class SuzukiYoshida(AbstractComposition):
         self.weights = triple_jump(order)
         self.composed_order = order
 
-    def order(self, terms):
+    def order(self, terms) -> int:
         return self.composed_order
 
 
@@ -291,7 +210,7 @@ class PresymplecticYoshida4(AbstractComposition):
         self.base = PresymplecticLeapfrog(first, root_finder, root_find_max_steps)
         self.weights = triple_jump(4)
 
-    def order(self, terms):
+    def order(self, terms) -> int:
         return 4
 
 
@@ -305,7 +224,7 @@ class _AbstractTabulated(AbstractComposition):
     def weights(self) -> Weights:
         return self.tableau.weights
 
-    def order(self, terms):
+    def order(self, terms) -> int:
         return self.tableau.order
 
 
@@ -454,7 +373,7 @@ class Substeps(AbstractComposition):
         self.base = base
         self.weights = (1 / n,) * n
 
-    def order(self, terms):
+    def order(self, terms) -> int:
         return self.base.order(terms)
 
 

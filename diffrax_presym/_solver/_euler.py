@@ -3,11 +3,12 @@ from typing import Literal
 import equinox as eqx
 import optimistix as optx
 
-from .._term import State, View
-from ._base import AbstractKickDriftSolver
+from .._system import System
+from ._engine import Moves
+from ._frozen import AbstractFrozenSolver
 
 
-class PresymplecticEuler(AbstractKickDriftSolver[None]):
+class PresymplecticEuler(AbstractFrozenSolver[None]):
     """Presymplectic Euler's method.
 
     1st order. One force evaluation per step, explicit for separable Hamiltonians and
@@ -35,21 +36,12 @@ class PresymplecticEuler(AbstractKickDriftSolver[None]):
         other = "position" if self.first == "momentum" else "momentum"
         return PresymplecticEuler(other, self.root_finder, self.root_find_max_steps)
 
-    def order(self, terms):
+    def order(self, terms) -> int:
         return 1
 
-    def start(self, view: View, t, y: State):
-        return None
-
-    def advance(self, view: View, t0, t1, h, y: State, carry: None):
-        if self.first == "momentum":
-            y, result = self.momentum_first(view, t0, h, y)
-        else:
-            y, _, result = self.position_first(view, t0, h, y, t1)
-        return y, None, result
-
-    def slope(self, view: View, t, y: State, carry: None) -> State:
-        return view.slope(t, y)
+    def moves(self, system: System) -> Moves:
+        momentum_first = self.momentum_first(system)
+        return momentum_first if self.first == "momentum" else momentum_first.inverse
 
 
 _ARGUMENTS = """**Arguments:**

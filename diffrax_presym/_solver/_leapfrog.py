@@ -2,14 +2,16 @@ from typing import Literal
 
 import equinox as eqx
 import optimistix as optx
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
-from .._term import State, View
-from ._base import AbstractKickDriftSolver, first_failure
+from .._split import State
+from .._system import System
+from ._engine import Moves, Stages
 from ._euler import _ARGUMENTS
+from ._frozen import AbstractFrozenSolver
 
 
-class PresymplecticLeapfrog(AbstractKickDriftSolver[PyTree]):
+class PresymplecticLeapfrog(AbstractFrozenSolver[PyTree]):
     """The presymplectic leapfrog, also known as Störmer--Verlet.
 
     2nd order and symmetric. One force evaluation per step, explicit for separable
@@ -43,30 +45,30 @@ class PresymplecticLeapfrog(AbstractKickDriftSolver[PyTree]):
     def is_symmetric(self) -> bool:
         return True
 
-    def order(self, terms):
+    def order(self, terms) -> int:
         return 2
 
-    def start(self, view: View, t, y: State):
+    def start(self, system: System, t: Array, y: State) -> PyTree:
         # The force that ends a step starts the next only if it does not depend on `p`.
-        if self.first == "momentum" and view.is_separable:
-            return view.force(t, y)
+        if self.first == "momentum" and system.is_separable:
+            return system.force(t, y)
         return None
 
-    def advance(self, view: View, t0, t1, h, y: State, carry: PyTree):
-        half = h / 2
-        middle = t0 + half
+    def moves(self, system: System) -> Moves:
+        known = self.first == "momentum" and system.is_separable
+        A, B = self.momentum_first(system, known), self.momentum_first(system).inverse
+        halves = [(0, 0.5, 0.5), (0.5, 1, 0.5)]
         if self.first == "momentum":
-            y, result0 = self.momentum_first(view, t0, half, y, carry)
-            y, force, result1 = self.position_first(view, middle, half, y, t1)
-            carry = force if view.is_separable else None
-        else:
-            y, force, result0 = self.position_first(view, t0, half, y, middle)
-            force = force if view.is_separable else None
-            y, result1 = self.momentum_first(view, middle, half, y, force)
-        return y, carry, first_failure(result0, result1)
+            return Stages([A, B], halves)
+        if not system.is_separable:
+            return Stages([B, A], halves)
+        # Two kicks at one place are one.
+        (kick, drift), (drift_end, _) = A.moves, B.moves
+        table = [(0, 0.5, 0.5), (0.5, 0.5, 1), (0.5, 1, 0.5)]
+        return Stages([drift_end, kick, drift], table)
 
-    def slope(self, view: View, t, y: State, carry: PyTree) -> State:
-        return view.slope(t, y, force=carry)
+    def slope(self, system: System, t: Array, y: State, carry: PyTree) -> State:
+        return system.slope(t, y, force=carry)
 
 
 PresymplecticLeapfrog.__init__.__doc__ = _ARGUMENTS

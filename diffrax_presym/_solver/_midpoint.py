@@ -1,14 +1,15 @@
-import diffrax as dfx
 import equinox as eqx
-import jax.tree_util as jtu
 import optimistix as optx
 
-from .._misc import check_root_finder, tree_add, tree_sub
-from .._term import State, View
-from ._base import AbstractPresymplecticSolver
+from .._misc import check_root_finder, tree_scale
+from .._split import State
+from .._system import System
+from ._base import AbstractMoveSolver
+from ._engine import Move, Moves, Outcome, Span, Stage
+from ._moves import root_find
 
 
-class PresymplecticMidpoint(AbstractPresymplecticSolver[None]):
+class PresymplecticMidpoint(AbstractMoveSolver[None]):
     """The implicit midpoint rule, in the frame of the middle of the step.
 
     2nd order and symmetric. Implicit for every Hamiltonian: one root find per step, for
@@ -42,32 +43,27 @@ class PresymplecticMidpoint(AbstractPresymplecticSolver[None]):
     def is_symmetric(self) -> bool:
         return True
 
-    def order(self, terms):
+    def order(self, terms) -> int:
         return 2
 
-    def start(self, view: View, t, y: State) -> None:
-        return None
+    def moves(self, system: System) -> Moves:
+        find = root_find(self.root_finder, self.root_find_max_steps)
 
-    def advance(self, view: View, t0, t1, h, y: State, carry: None):
-        half = h / 2
-        middle = t0 + half
-        q, p = y
-        y = q, view.move_frame(t0, half, p)
-        field = lambda y: (view.velocity(middle, y), view.force(middle, y))
-        residual = lambda z, _: tree_sub(tree_add(y, half, field(z)), z)
-        solution = optx.root_find(
-            residual,
-            self.root_finder,
-            y,
-            max_steps=self.root_find_max_steps,
-            throw=False,
-        )
-        q, p = jtu.tree_map(lambda z, y: y + 2 * (z - y), solution.value, y)
-        y = q, view.move_frame(middle, half, p)
-        return y, None, dfx.RESULTS.promote(solution.result)
+        def step(system: System, span: Span, stage: Stage) -> Outcome:
+            (q, p), carry = stage
+            half = span.h / 2
+            middle = span.t0 + half
+            y = q, system.move_frame(span.t0, half, p)
 
-    def slope(self, view: View, t, y: State, carry: None) -> State:
-        return view.slope(t, y)
+            def field(dy: State) -> State:
+                inside = system.add(y, 1, dy)
+                return system.velocity(middle, inside), system.force(middle, inside)
+
+            dy, result = find(lambda dy: tree_scale(half, field(dy)), system.values(y))
+            q, p = system.add(y, 2, dy)
+            return ((q, system.move_frame(middle, half, p)), carry), result
+
+        return Move(step, step)
 
 
 PresymplecticMidpoint.__init__.__doc__ = """**Arguments:**

@@ -1,17 +1,17 @@
 import math
-from typing import ClassVar, TYPE_CHECKING
+from typing import ClassVar
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
-from .._misc import cast_to, tree_add, tree_sum
-from .._scan import scan_stages
-from .._term import State, View
-from ._base import AbstractPresymplecticSolver, Clock, pull_back, stage_table
+from .._misc import AbstractVar
+from .._split import AbstractSplit, State
+from .._system import System
+from ._base import AbstractMoveSolver
+from ._composition import rows
+from ._engine import Moves, Stages
+from ._moves import drift, kick, to_split
 from ._tableaus import (
     BLANES_CASAS_RKN_8,
     BLANES_MOAN_4,
@@ -23,18 +23,14 @@ from ._tableaus import (
     TUNED_LINEAR_8,
     TUNED_RKN_6,
 )
-from ._variables import Shared, Swapped
 
 
-if TYPE_CHECKING:
-    # To a type checker an abstract field is any kind of field.
-    from typing import ClassVar as AbstractVar
-else:
-    from equinox import AbstractVar
+class AbstractSplitting(AbstractMoveSolver[PyTree]):
+    """Exact drifts and kicks alternately, each with a fraction of the step of its own.
 
-
-class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
-    """Exact drifts and kicks by turns, each with a fraction of the step of its own."""
+    In the variables of a split, mostly `(q, p)`: where the potential is quadratic
+    instead of the kinetic energy, their roles are swapped.
+    """
 
     tableau: AbstractVar[SplittingTableau]
 
@@ -42,37 +38,34 @@ class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
     def is_symmetric(self) -> bool:
         return self.tableau.fractions == self.tableau.fractions[::-1]
 
-    @property
-    def reverse(self) -> "AbstractSplitting":
-        backwards = self.tableau.fractions[::-1]
-        return (
-            self
-            if self.is_symmetric
-            else Splitting(self.tableau._replace(fractions=backwards))
-        )
-
-    def order(self, terms):
+    def order(self, terms) -> int:
         return self.tableau.order
 
-    def variables(self, view: View) -> View | Swapped | Shared:
-        """The variables to step in, after a check that this scheme can do the system.
+    @property
+    def kind(self) -> str:
+        """The kind of split that the scheme needs."""
+        return "nystrom" if self.tableau.quadratic else "any"
 
-        Mostly those of the state. Where the potential is quadratic instead of the
-        kinetic energy, their roles are swapped.
-        """
-        hamiltonian, name = view.hamiltonian, type(self).__name__
-        if not hamiltonian.is_split:
+    def split(self, system: System) -> AbstractSplit:
+        """The split to step in; an error if the system offers none of the kind."""
+        split, name = system.split(self.kind), type(self).__name__
+        if split is not None:
+            return split
+        if self.kind == "shared":
+            raise ValueError(
+                f"`{name}` needs a mass that does not depend on time, and known: "
+                "write `ConformalHamiltonian(QuadraticKinetic(mass), potential, "
+                "damping)` or `SeparableHamiltonian(QuadraticKinetic(mass), "
+                "potential)`. For any other use `TunedRKN6()` or `BlanesMoan6()`."
+            )
+        if system.split("any") is None:
             raise ValueError(
                 f"`{name}` needs a Hamiltonian split into a kinetic part and a "
-                f"potential, but this `{type(hamiltonian).__name__}` is not. "
+                f"potential, but this `{system.name}` is not. "
                 "If it is a sum of the two, give its parts: `SeparableHamiltonian("
                 "kinetic, potential)` or `ConformalHamiltonian(kinetic, potential, "
                 "damping)`. For any other use `PresymplecticCoupled()`."
             )
-        if hamiltonian.is_quadratic or not self.tableau.quadratic:
-            return view
-        if hamiltonian.has_quadratic_potential:
-            return Swapped(view)
         raise ValueError(
             f"`{name}` keeps its order only for a kinetic energy quadratic in the "
             "momentum, and known to be: write it as `QuadraticKinetic(mass)`; or for a "
@@ -80,99 +73,36 @@ class AbstractSplitting(AbstractPresymplecticSolver[PyTree]):
             "other use `BlanesMoan4()` or `BlanesMoan6()`."
         )
 
-    def start(self, view: View, t, y: State):
-        inner = self.variables(view)
+    def start(self, system: System, t: Array, y: State) -> PyTree:
+        split = self.split(system)
         # The force that ends a step starts the next, if the step starts with a kick.
         if not self.tableau.kick_first:
             return None
-        return inner.potential_force(t, inner.enter(t, y))
+        return split.force(system, t, split.to_split(system, t, y))
 
-    def advance(self, view: View, t0, t1, h, y: State, carry: PyTree):
-        inner = self.variables(view)
-        y = inner.enter(t0, y)
-        fractions = self.tableau.fractions
-        kick_first = self.tableau.kick_first
-        if kick_first:
-            y = kick(y, fractions[0] * h, carry)
-            fractions = fractions[1:]
-        drifts, kicks = fractions[0::2], fractions[1::2]
-        clock, order = Clock(t0, t1, h), self.tableau.order
-
-        def stage(state, moves):
-            start, end, drift, impulse = moves
-            y, _ = state
-            y = inner.drift(clock(start), drift * h, y, order)
-            force = inner.potential_force(clock(end), y)
-            return (kick(y, impulse * h, force), force if kick_first else None), None
-
-        table = stage_table(drifts, h)
-        paired = *(x[: len(kicks)] for x in table), cast_to(np.array(kicks), h)
-        (y, carry), _ = scan_stages(stage, (y, carry), paired)
-        if not kick_first:
-            start, _, drift = (x[-1] for x in table)
-            y = inner.drift(clock(start), drift * h, y, order)
-        return inner.leave(t1, y), carry, None
-
-    def pull_back(self, view: View, wanted: PyTree, t0, t1, h, end, bar):
-        if self.variables(view) is not view:
-            return super().pull_back(view, wanted, t0, t1, h, end, bar)
-        fractions, kick_first = self.tableau.fractions, self.tableau.kick_first
-        clock, order = Clock(t0, t1, h), self.tableau.order
-        drifts, kicks = fractions[kick_first::2], fractions[1 + kick_first :: 2]
-        table = stage_table(drifts, h)
-        gradient = jtu.tree_map(jnp.zeros_like, eqx.filter(view, wanted))
-        (y, force), (y_bar, force_bar) = end, bar
-
-        # Move by move, as `advance` made them, so that none is made more often than it
-        # must be.
-        def drift(start, end, length):
-            there = lambda view, y: view.drift(clock(start), length * h, y, order)
-            back = lambda y: view.drift(clock(end), -length * h, y, order)
-            return back, there
-
-        def stage(state, moves):
-            (y, y_bar, force_bar), gradient = state
-            *times, impulse = moves
-            back, there = drift(*times)
-            t = clock(times[1])
-
-            def undo(y):
-                return back(kick(y, -impulse * h, view.potential_force(t, y)))
-
-            def redo(view, y):
-                y = there(view, y)
-                force = view.potential_force(t, y)
-                return kick(y, impulse * h, force), force
-
-            pulled = pull_back(undo, redo, view, wanted, y, (y_bar, force_bar))
-            y, more, y_bar = pulled
-            # Only the last force is carried on.
-            none = jtu.tree_map(jnp.zeros_like, force_bar)
-            return ((y, y_bar, none), tree_sum(gradient, more)), None
-
-        if not kick_first:
-            pulled = pull_back(*drift(*(x[-1] for x in table)), view, wanted, y, y_bar)
-            y, more, y_bar = pulled
-            gradient = tree_sum(gradient, more)
-            force_bar = jtu.tree_map(jnp.zeros_like, y[1])
-        paired = *(x[: len(kicks)] for x in table), cast_to(np.array(kicks), h)
-        state = (y, y_bar, force_bar), gradient
-        ((y, y_bar, _), gradient), _ = scan_stages(stage, state, paired, reverse=True)
-        if kick_first:
-            force = view.potential_force(t0, y)
-            first = fractions[0] * h
-            y = kick(y, -first, force)
-            _, pull = jax.vjp(lambda y, force: kick(y, first, force), y, force)
-            y_bar, force_bar = pull(y_bar)
+    def moves(self, system: System) -> Moves:
+        self.split(system)
+        kind, tableau = self.kind, self.tableau
+        enter, flow = to_split(kind), drift(kind, tableau.order)
+        drifts = rows(tableau.fractions[tableau.kick_first :: 2])
+        kicks = tableau.fractions[not tableau.kick_first :: 2]
+        pairs = kicks[tableau.kick_first :]
+        ends = drifts[: len(pairs), 1]
+        table = np.stack([ends, ends, pairs], axis=-1)
+        table = np.stack([drifts[: len(pairs)], table], axis=1)
+        stages = Stages([flow, kick(kind)], table)
+        if tableau.kick_first:
+            moves = enter, kick(kind, known=True), stages, enter.inverse
+            spans = [(0, 0, 0), (0, 0, kicks[0]), (0, 1, 1), (1, 1, 0)]
         else:
-            force, force_bar = end[1], bar[1]
-        return (y, force), gradient, (y_bar, force_bar)
+            moves = enter, stages, flow, enter.inverse
+            spans = [(0, 0, 0), (0, 1, 1), drifts[-1], (1, 1, 0)]
+        return Stages(moves, spans)
 
-    def slope(self, view: View, t, y: State, carry: PyTree) -> State:
-        # What is carried is all of the force only if none of it is kinetic, and if it
-        # is a force.
-        known = view.is_separable and self.variables(view) is view
-        return view.slope(t, y, force=carry if known else None)
+    def slope(self, system: System, t: Array, y: State, carry: PyTree) -> State:
+        # A kick is by all of the force only if none of it is kinetic.
+        known = "separable" in self.split(system).kinds
+        return system.slope(t, y, force=carry if known else None)
 
 
 class Splitting(AbstractSplitting):
@@ -403,18 +333,6 @@ class TunedLinear8(AbstractSplitting):
 
     tableau: ClassVar[SplittingTableau] = TUNED_LINEAR_8
 
-    def variables(self, view: View) -> Shared:
-        kinetic = view.hamiltonian.quadratic_kinetic
-        if kinetic is None:
-            raise ValueError(
-                "`TunedLinear8` needs a mass that does not depend on time, and known: "
-                "write `ConformalHamiltonian(QuadraticKinetic(mass), potential, "
-                "damping)` or `SeparableHamiltonian(QuadraticKinetic(mass), "
-                "potential)`. For any other use `TunedRKN6()` or `BlanesMoan6()`."
-            )
-        return Shared(view, kinetic)
-
-
-def kick(y: State, h, force: PyTree) -> State:
-    q, p = y
-    return q, tree_add(p, h, force)
+    @property
+    def kind(self) -> str:
+        return "shared"

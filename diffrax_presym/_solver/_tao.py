@@ -1,18 +1,19 @@
-import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, Inexact
+from jaxtyping import Array, Inexact
 
-from .._misc import as_positive, cast_to, tree_add, tree_scale, tree_sub
-from .._term import State, View
-from ._base import AbstractPresymplecticSolver
+from .._misc import as_positive, cast_to, tree_sub
+from .._split import State
+from .._system import System
+from ._base import AbstractMoveSolver
+from ._copies import coupling, exchange, largest, move_frames, paired_field
+from ._engine import Moves, Stages
 
 
 _Carry = tuple[State, State]
 
 
-class PresymplecticTao(AbstractPresymplecticSolver[_Carry]):
+class PresymplecticTao(AbstractMoveSolver[_Carry]):
     r"""Tao's augmented integrator, explicit for every Hamiltonian.
 
     2nd order, symmetric, and conformally symplectic in the doubled phase space. Three
@@ -72,29 +73,35 @@ class PresymplecticTao(AbstractPresymplecticSolver[_Carry]):
     def is_symmetric(self) -> bool:
         return True
 
-    def order(self, terms):
+    def order(self, terms) -> int:
         return 2
 
-    def start(self, view: View, t, y: State) -> _Carry:
-        return y, paired_field(view, t, y, y)
+    def start(self, system: System, t: Array, y: State) -> _Carry:
+        return y, paired_field(system, t, y, y)
 
-    def advance(self, view: View, t0, t1, h, y: State, carry: _Carry):
-        half = h / 2
-        middle = t0 + half
-        copy, field = carry
-        y, copy = exchange(half, field, y, copy)
-        y, copy = (move_frame(view, t0, half, x) for x in (y, copy))
-        copy, y = exchange(half, paired_field(view, middle, copy, y), copy, y)
-        y, copy = _rotate(self._angle(h), y, copy)
-        copy, y = exchange(half, paired_field(view, middle, copy, y), copy, y)
-        y, copy = (move_frame(view, middle, half, x) for x in (y, copy))
+    def moves(self, system: System) -> Moves:
         # The last map leaves its own arguments alone: its field starts the next step.
-        field = paired_field(view, t1, y, copy)
-        y, copy = exchange(half, field, y, copy)
-        return y, (copy, field), None
+        moves = (
+            *(exchange(known=True), move_frames, exchange(second=True)),
+            coupling(self._angle),
+            *(exchange(second=True), move_frames, exchange()),
+        )
+        table = [
+            *((0, 0, 0.5), (0, 0.5, 0.5), (0.5, 0.5, 0.5)),
+            (0.5, 0.5, 1),
+            *((0.5, 0.5, 0.5), (0.5, 1, 0.5), (1, 1, 0.5)),
+        ]
+        return Stages(moves, table)
 
-    def slope(self, view: View, t, y: State, carry: _Carry) -> State:
-        return view.slope(t, y)
+    def composition_error(self) -> str | None:
+        if self.coupling is not None:
+            return None
+        return (
+            "Inside a composition `PresymplecticTao` needs a coupling that does not "
+            "change with the step, or the order is lost. Write "
+            "`PresymplecticTao(coupling)` with a few times the highest frequency of "
+            "the system, or `PresymplecticCoupled(order)`, which needs none."
+        )
 
     def distance(self, y: State, solver_state: _Carry) -> Array:
         """The largest difference between the copies, in any entry of `q` or `p`.
@@ -108,7 +115,7 @@ class PresymplecticTao(AbstractPresymplecticSolver[_Carry]):
         copy, _ = solver_state
         return largest(tree_sub(y, copy))
 
-    def _angle(self, h):
+    def _angle(self, h: Array) -> Array:
         if self.coupling is None:
             return jnp.copysign(cast_to(3 * np.pi / 8, h), h)
         if jnp.shape(self.coupling) != ():
@@ -118,47 +125,3 @@ class PresymplecticTao(AbstractPresymplecticSolver[_Carry]):
                 "with `jax.vmap`."
             )
         return 2 * cast_to(self.coupling, h) * h
-
-
-def paired_field(view: View, t, y: State, copy: State) -> State:
-    """Velocity and force where `q` is of one copy and `p` of the other."""
-    at = (y[0], copy[1])
-    return view.velocity(t, at), view.force(t, at)
-
-
-def exchange(h, field: State, y: State, copy: State) -> tuple[State, State]:
-    """The flow of `H(t, q, p_copy)`: equation (tao_map1)."""
-    velocity, force = field
-    (q, p), (q_copy, p_copy) = y, copy
-    return (q, tree_add(p, h, force)), (tree_add(q_copy, h, velocity), p_copy)
-
-
-def move_frame(view: View, t, h, y: State) -> State:
-    q, p = y
-    return q, view.move_frame(t, h, p)
-
-
-def _rotate(angle, y: State, copy: State) -> tuple[State, State]:
-    """The flow of the coupling, which turns the difference: equation (tao_map2)."""
-    mean = jtu.tree_map(lambda a, b: (a + b) / 2, y, copy)
-    half = turn(angle, jtu.tree_map(lambda a, b: (a - b) / 2, y, copy))
-    return tree_add(mean, 1, half), tree_sub(mean, half)
-
-
-def turn(angle, y: State, scale: ArrayLike = 1.0) -> State:
-    """`q` and `p` turned into each other, with `q` in units of `scale`.
-
-    Both change at once. One after the other they would still look right in the energy,
-    and not be symplectic.
-    """
-    cos, sin = jnp.cos(angle), jnp.sin(angle)
-    q, p = y
-    q1 = tree_add(tree_scale(cos, q), sin * scale, p)
-    return q1, tree_add(tree_scale(cos, p), -sin / scale, q)
-
-
-def largest(x: State) -> Array:
-    """The largest of all entries, without its sign."""
-    sizes = jtu.tree_map(lambda x: jnp.max(jnp.abs(x), initial=0), x)
-    with jax.numpy_dtype_promotion("standard"):
-        return jtu.tree_reduce(jnp.maximum, sizes)

@@ -1,0 +1,1 @@
+from ._reversible import ReversibleAdjoint as ReversibleAdjoint

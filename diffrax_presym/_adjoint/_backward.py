@@ -1,0 +1,207 @@
+"""From the end of a step to its start, with the cotangents."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, PyTree
+
+from .._misc import tree_sum
+from .._solver._engine import Span, undo, vjp_step
+from .._system import System
+from ._saves import is_within, materialise, Saved, SavedOutputs
+
+
+class Inputs(NamedTuple):
+    """What goes into a solve."""
+
+    start: tuple[PyTree, PyTree]  # the state, and what the solver carries besides
+    parameters: tuple[System, list[Callable]]  # the system, and functions to be saved
+    rest: dict[str, Any]  # all that is not differentiated
+
+
+class Position(NamedTuple):
+    """How far the solve has been run backwards."""
+
+    n: Array  # the steps that are left
+    t: Array
+    state: tuple[PyTree, PyTree]
+    bar: tuple[PyTree, PyTree]  # the cotangents of the state
+    gradient: PyTree  # the cotangents of the parameters so far
+    left: list[Saved]
+
+
+class Backward:
+    """The steps of a solve, each of which can be taken back."""
+
+    def __init__(self, inputs: Inputs, perturbed: Inputs, final, cotangents):
+        rest = inputs.rest
+        self.solver, self.first, self.final = rest["solver"], inputs.start, final
+        self.time = clock(
+            *(rest[x] for x in ("stepsize_controller", "t0", "t1", "dt0"))
+        )
+        self.system, _ = inputs.parameters
+        # Of the system, and of all parameters, what is differentiated.
+        self.wanted, _ = perturbed.parameters
+        self.moved, self.fixed = eqx.partition(inputs.parameters, perturbed.parameters)
+        saved = rest["saveat"], final, cotangents, self.moved, self.fixed
+        self.saves = SavedOutputs(*saved)
+        self.dense = materialise(final.dense_infos, cotangents.dense_infos)
+        self.carried = materialise(final.solver_state, cotangents.solver_state)
+
+    def span(self, n: Array) -> Span:
+        """That of step `n`, in physical time."""
+        t0, t1 = (self.system.time(self.time(i)) for i in (n, n + 1))
+        return Span(t0, t1, self.solver.step_length(t0, t1))
+
+    def advance(self, n: Array, state: PyTree) -> PyTree:
+        return self.solver.advance(self.system, *self.span(n), *state)[:2]
+
+    def end(self) -> Position:
+        y, carry, n = self.final.y, self.final.solver_state, self.final.num_steps
+        bar = jtu.tree_map(jnp.zeros_like, y), self.carried
+        gradient = jtu.tree_map(jnp.zeros_like, self.moved)
+        left = self.saves.left_at_end(n)
+        at = Position(n, self.time(n), (y, carry), bar, gradient, left)
+        for i, sub in enumerate(self.saves.subs):
+            # It may have been saved as a step already.
+            if sub.t1 and sub.steps != 1:
+                here = sub.steps == 0 or n % sub.steps != 0
+                at = self._pull_output(at, i, left[i].outputs, here)
+        return at
+
+    def start(self, at: Position) -> Position:
+        """All that is left was saved at the start, which is more than one state only if
+        the solve has no length."""
+        for i, left in enumerate(at.left):
+            bar = self.saves.sum_of_first(i, left.outputs)
+            at = _add(at, self.saves.pull_saved_output(i, at.t, at.state[0], bar))
+        return at
+
+    def step(self, at: Position, start: PyTree | None = None) -> Position:
+        """Back to the start of the step that ends here; from there, if it is known."""
+        n, system, solver = at.n - 1, self.system, self.solver
+        span, moves = self.span(n), solver.moves(system)
+        for i, sub in enumerate(self.saves.subs):
+            if sub.steps != 0:
+                at = self._unsave_step(at, i, at.n % sub.steps == 0)
+        start_bar = jtu.tree_map(jnp.zeros_like, at.bar)
+        if self._may_interpolate():
+            # In most steps nothing was saved between their ends, which is cheaper.
+            inner = lambda at: self._pull_interpolated(
+                at,
+                n,
+                span,
+                undo(moves, system, span, at.state) if start is None else start,
+            )
+            skip = lambda at: (at, start_bar)
+            at, start_bar = lax.cond(self._interpolates(at.left, n), inner, skip, at)
+        if start is None:
+            pulled = vjp_step(moves, system, self.wanted, span, at.state, at.bar)
+        else:
+            wanted, rest = eqx.partition(system, self.wanted)
+            redo = lambda wanted, x: solver.advance(
+                eqx.combine(wanted, rest), *span, *x
+            )[:2]
+            pulled = start, *jax.vjp(redo, wanted, start)[1](at.bar)
+        start, more, bar = pulled
+        more = (more, jtu.tree_map(jnp.zeros_like, self.moved[1]))
+        gradient, bar = tree_sum((at.gradient, bar), (more, start_bar))
+        return Position(n, self.time(n), start, bar, gradient, at.left)
+
+    def _may_interpolate(self) -> bool:
+        return self.dense is not None or any(s.ts is not None for s in self.saves.subs)
+
+    def _interpolates(self, left: list[Saved], n: Array):
+        """Whether anything that is left was saved by interpolation in step `n`."""
+        if self.dense is not None:
+            return True
+        inside = [
+            is_within(sub.ts, saved.times, n, self.time(n))
+            for sub, saved in zip(self.saves.subs, left, strict=True)
+            if sub.ts is not None
+        ]
+        return jnp.any(jnp.stack(inside))
+
+    def _pull_output(self, at: Position, i: int, index: Array, pred) -> Position:
+        bar = self.saves.bar_at(i, index, pred)
+        return _add(at, self.saves.pull_saved_output(i, at.t, at.state[0], bar))
+
+    def _unsave_step(self, at: Position, i: int, pred: Array) -> Position:
+        """Pull the last output back, if it is of this step's end."""
+        times, outputs = at.left[i]
+        outputs = outputs - jnp.where(pred, 1, 0)
+        at = self._pull_output(at, i, outputs, pred)
+        left = [*at.left[:i], Saved(times, outputs), *at.left[i + 1 :]]
+        return at._replace(left=left)
+
+    def _pull_interpolated(self, at: Position, n: Array, span: Span, start: PyTree):
+        """Pull back what was saved between the ends of a step: to its end, within the
+        position, and to its start."""
+        t_start = self.time(n)
+
+        def dense_info(moved, start, end):
+            system, _ = eqx.combine(moved, self.fixed)
+            return self.solver.dense_info(system, *span, start, end)
+
+        info, pull = jax.vjp(dense_info, self.moved, start, at.state)
+        info_bar = jtu.tree_map(jnp.zeros_like, info)
+        if self.dense is not None:
+            info_bar = jtu.tree_map(lambda x: x[n], self.dense)
+
+        def take(i, x):
+            (times, outputs), (gradient, info_bar) = x
+            times, outputs = times - 1, outputs - 1
+            t = self.saves.subs[i].ts[times]
+            evaluate = lambda info: self.solver.interpolation_cls(
+                t0=t_start, t1=at.t, **info
+            ).evaluate(t)
+            y, pull = jax.vjp(evaluate, info)
+            bar = self.saves.bar_at(i, outputs, True)
+            more, y_bar = self.saves.pull_saved_output(i, t, y, bar)
+            sums = tree_sum((gradient, info_bar), (more, *pull(y_bar)))
+            return Saved(times, outputs), sums
+
+        sums, left = (at.gradient, info_bar), list(at.left)
+        for i, sub in enumerate(self.saves.subs):
+            if sub.ts is not None:
+                inside = lambda x, ts=sub.ts: is_within(ts, x[0].times, n, t_start)
+                left[i], sums = lax.while_loop(
+                    inside, partial(take, i), (left[i], sums)
+                )
+        gradient, info_bar = sums
+        more, start_bar, end_bar = pull(info_bar)
+        gradient, bar = tree_sum((gradient, at.bar), (more, end_bar))
+        return at._replace(gradient=gradient, bar=bar, left=left), start_bar
+
+
+def _add(at: Position, bars) -> Position:
+    gradient, y_bar = bars
+    y, carry = at.bar
+    gradient = tree_sum(at.gradient, gradient)
+    return at._replace(gradient=gradient, bar=(tree_sum(y, y_bar), carry))
+
+
+def clock(controller, t0: Array, t1: Array, dt0: Array) -> Callable[[Array], Array]:
+    """When step `n` starts, as the step size controllers of Diffrax would have it."""
+    if isinstance(controller, dfx.StepTo):
+        return lambda n: controller.ts[n]
+    up, down = (jnp.asarray(sign * jnp.inf, t0.dtype) for sign in (1, -1))
+    steps = jnp.ceil((t1 - t0) / jnp.nextafter(dt0, up))
+    almost = t1
+    for _ in range(100):
+        almost = jnp.nextafter(almost, down)
+
+    def time(n):
+        t = t0 + (t1 - t0) * (n.astype(t0.dtype) / steps)
+        t = jnp.where((n >= steps) | (t > almost), t1, t)
+        # The first step alone is of the length that was asked for.
+        return jnp.where(n == 1, jnp.minimum(t0 + dt0, t1), t)
+
+    return time

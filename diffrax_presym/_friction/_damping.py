@@ -1,0 +1,316 @@
+"""Friction at one rate for all momenta, which may depend on time."""
+
+import abc
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, PyTree
+
+from .._misc import as_parameter, as_time, cast_to, tree_add, tree_scale
+from ._base import AbstractFriction, Scalar, Time
+from ._functions import expm1, expm1_ratio, quadrature
+
+
+class AbstractDamping(AbstractFriction):
+    r"""A log scale $\eta(t)$, or friction $p' = F - \eta'(t) \, p$.
+
+    Positive rates $\eta'$ damp, negative rates excite. A law of your own gives
+    `__call__`, `increment` and `rate`; all else follows from these, `integral` and
+    `response` by quadrature.
+    """
+
+    @abc.abstractmethod
+    def __call__(self, t: Time) -> Scalar:
+        r"""The log scale $\eta(t)$."""
+
+    @abc.abstractmethod
+    def increment(self, t: Time, h: Time) -> Scalar:
+        r"""The difference $\eta(t + h) - \eta(t)$.
+
+        Solvers use $\eta$ through its differences alone. Subtracting two values loses
+        most digits at late times in `float32`, so each law gives its difference in a
+        form without cancellation.
+        """
+
+    @abc.abstractmethod
+    def rate(self, t: Time) -> Scalar:
+        r"""The rate of damping $\eta'(t)$."""
+
+    def integral(self, t: Time, h: Time, order: int) -> Scalar:
+        r"""The integral of $e^{\eta(t) - \eta(s)}$ over $s$ from $t$ to $t + h$.
+
+        The displacement under a velocity that is one at $t$ and decays by friction.
+        Exact where the law allows, and otherwise to the given order in `h`.
+        """
+        return quadrature(lambda s: jnp.exp(-self.increment(t, s)), h, order)
+
+    def response(self, t: Time, h: Time, order: int) -> Scalar:
+        r"""The integral of $e^{\eta(s) - \eta(t + h)}$ over $s$ from $t$ to $t + h$.
+
+        The momentum gained under a unit force. Exact where the law allows, and
+        otherwise to the given order in `h`.
+        """
+        return quadrature(lambda s: jnp.exp(-self.increment(t + s, h - s)), h, order)
+
+    def decay(self, t: Time, h: Time, p: PyTree) -> PyTree:
+        # As a factor, rounding would make the same error at every step, and equal
+        # errors add up. The errors of increments vary with `p`, and mostly cancel.
+        return tree_scale(expm1(-_one_number(self.increment(t, h))), p)
+
+    def carry(self, t: Time, h: Time, p: PyTree, order: int) -> PyTree:
+        return tree_scale(self.integral(t, h, order), p)
+
+    def respond(self, t: Time, h: Time, force: PyTree, order: int) -> PyTree:
+        return tree_scale(self.response(t, h, order), force)
+
+    def net_force(self, t: Time, force: PyTree, p: PyTree) -> PyTree:
+        rate, singular = _one_number(self.rate(t)), self.is_singular(t)
+        if singular is None:
+            return tree_add(force, -rate, p)
+        regular = tree_add(force, -jnp.where(singular, 0, rate), p)
+        return jax.tree.map(
+            lambda f, x, p: jnp.where(singular, self._at_rest(rate, f, p), x),
+            *(force, regular, p),
+        )
+
+    def _at_rest(self, rate: Scalar, force: Array, p: Array) -> Array:
+        """The limit of `F - gamma p / t` for `t` to zero, on the motion from rest.
+
+        There `p` grows like `F t / (1 + gamma)`. From any other momentum there is none,
+        unless the rate is zero.
+        """
+        limit = force / (1 + cast_to(self.strength, force))
+        return jnp.where((p == 0) | (rate == 0), limit, jnp.nan)
+
+    @property
+    def strength(self) -> Scalar | float:
+        """The rate times the time since it was infinite, if ever it was."""
+        return 0.0
+
+    def amplification(self, t: Time, h: Time) -> Scalar:
+        return jnp.exp(self.increment(t, h))
+
+    def is_singular(self, t: Time) -> Bool[Array, ""] | None:
+        return None
+
+
+def _one_number(damping: Scalar) -> Scalar:
+    if jnp.shape(damping) != ():
+        raise ValueError(
+            "The damping must be one number for the whole system, but has shape "
+            f"{jnp.shape(damping)}. The momenta share one frame; solve systems with "
+            "different dampings side by side with `jax.vmap`."
+        )
+    return damping
+
+
+def _infinite(gamma: Scalar) -> Scalar:
+    """Infinite with the sign of `gamma`, and zero where that is zero."""
+    return jnp.where(gamma == 0, 0, jnp.where(gamma > 0, jnp.inf, -jnp.inf))
+
+
+class ConstantDamping(AbstractDamping):
+    r"""The log scale $\eta(t) = \gamma t$: friction at the constant rate $\gamma$.
+
+    The heavy-ball method and the damped oscillator, equation (eta1_large) of França,
+    Jordan and Vidal (2021).
+    """
+
+    gamma: Scalar
+
+    def __init__(self, gamma):
+        """**Arguments:**
+
+        - `gamma`: the rate of damping, in units of one over time. A real number of any
+            sign; negative excites.
+        """
+        self.gamma = as_parameter(gamma, "`ConstantDamping(gamma)`")
+
+    def __call__(self, t: Time) -> Scalar:
+        t = as_time(t)
+        return cast_to(self.gamma, t) * t
+
+    def increment(self, t: Time, h: Time) -> Scalar:
+        h = as_time(h)
+        return cast_to(self.gamma, h) * h
+
+    def rate(self, t: Time) -> Scalar:
+        return cast_to(self.gamma, as_time(t))
+
+    def integral(self, t: Time, h: Time, order: int) -> Scalar:
+        return h * expm1_ratio(-self.increment(t, h))
+
+    def response(self, t: Time, h: Time, order: int) -> Scalar:
+        return self.integral(t, h, order)
+
+
+class LogDamping(AbstractDamping):
+    r"""The log scale $\eta(t) = \gamma \log(t + s)$: friction that decays as
+    $\gamma / (t + s)$.
+
+    With $\gamma = 3$ and no shift this is the ODE of Nesterov's method, equation
+    (eta1_small) of França, Jordan and Vidal (2021); with $s = 1$ their decaying
+    oscillator.
+
+    The rate is infinite at $t = -s$, where positive damping holds a system at rest: a
+    solve may start there, from zero momentum. Schemes whose stages leave the step, such
+    as [`diffrax_presym.PresymplecticYoshida4`][], need a start further from there than
+    the stages reach; else the solve is `nan`, which [`diffrax_presym.Checked`][]
+    reports.
+    """
+
+    gamma: Scalar
+    shift: Scalar
+
+    def __init__(self, gamma, shift: ArrayLike = 0.0):
+        """**Arguments:**
+
+        - `gamma`: the strength of the damping, a dimensionless number of any sign.
+        - `shift`: the shift $s$ of time, in units of time. Defaults to 0.
+        """
+        self.gamma = as_parameter(gamma, "`LogDamping(gamma)`")
+        self.shift = as_parameter(shift, "`LogDamping(shift=...)`")
+
+    def _since(self, t: Time) -> tuple[Bool[Array, ""], Scalar, Scalar]:
+        """Whether `t` is the singularity, the time since then, or one there, and
+        `gamma`."""
+        t = as_time(t)
+        since = t + cast_to(self.shift, t)
+        singular = since == 0
+        return singular, jnp.where(singular, 1, since), cast_to(self.gamma, t)
+
+    def __call__(self, t: Time) -> Scalar:
+        t = as_time(t)
+        return cast_to(self.gamma, t) * jnp.log(t + cast_to(self.shift, t))
+
+    def increment(self, t: Time, h: Time) -> Scalar:
+        singular, since, gamma = self._since(t)
+        regular = gamma * jnp.log1p(as_time(h) / since)
+        return jnp.where(singular & (h != 0), _infinite(gamma), regular)
+
+    def rate(self, t: Time) -> Scalar:
+        singular, since, gamma = self._since(t)
+        return jnp.where(singular, _infinite(gamma), gamma / since)
+
+    def integral(self, t: Time, h: Time, order: int) -> Scalar:
+        # With x = log((s + h) / s) it is s (exp((1 - gamma) x) - 1) / (1 - gamma).
+        singular, since, gamma = self._since(t)
+        growth = jnp.log1p(h / since)
+        carried = since * growth * expm1_ratio((1 - gamma) * growth)
+        # At the singularity all momentum is lost before it carries anywhere.
+        return jnp.where(singular, jnp.where(gamma == 0, h, 0), carried)
+
+    def response(self, t: Time, h: Time, order: int) -> Scalar:
+        # With the same x it is (s + h) (1 - exp(-(1 + gamma) x)) / (1 + gamma).
+        singular, since, gamma = self._since(t)
+        growth, power = jnp.log1p(h / since), 1 + gamma
+        gained = (since + h) * growth * expm1_ratio(-power * growth)
+        return jnp.where(singular, h / jnp.where(singular, power, 1), gained)
+
+    @property
+    def strength(self) -> Scalar:
+        return self.gamma
+
+    def is_singular(self, t: Time) -> Bool[Array, ""] | None:
+        return self._since(t)[0]
+
+
+class MixedDamping(AbstractDamping):
+    r"""The log scale $\eta(t) = \gamma_1 \log t + \gamma_2 t^\delta$.
+
+    Between [`diffrax_presym.LogDamping`][] and [`diffrax_presym.ConstantDamping`][]:
+    equation (damp_between) of França, Jordan and Vidal (2021). Time must be positive;
+    the remarks on $t = 0$ in [`diffrax_presym.LogDamping`][] hold here too.
+    """
+
+    gamma1: Scalar
+    gamma2: Scalar
+    delta: Scalar
+
+    def __init__(self, gamma1, gamma2, delta):
+        r"""**Arguments:**
+
+        - `gamma1`: the strength of the logarithmic part, dimensionless.
+        - `gamma2`: the strength of the power, in units of time to the power $-\delta$.
+        - `delta`: the exponent, between 0 and 1 in the paper.
+        """
+        self.gamma1 = as_parameter(gamma1, "`MixedDamping(gamma1, ...)`")
+        self.gamma2 = as_parameter(gamma2, "`MixedDamping(..., gamma2, ...)`")
+        self.delta = as_parameter(delta, "`MixedDamping(..., delta)`")
+
+    def _parameters(self, t: Time):
+        """Whether `t` is the singularity, `t` itself, or one there, and parameters."""
+        t = as_time(t)
+        parameters = (cast_to(x, t) for x in (self.gamma1, self.gamma2, self.delta))
+        return t == 0, jnp.where(t == 0, 1, t), *parameters
+
+    def __call__(self, t: Time) -> Scalar:
+        t = as_time(t)
+        _, _, gamma1, gamma2, delta = self._parameters(t)
+        return gamma1 * jnp.log(t) + gamma2 * t**delta
+
+    def increment(self, t: Time, h: Time) -> Scalar:
+        singular, t, gamma1, gamma2, delta = self._parameters(t)
+        h = as_time(h)
+        growth = jnp.log1p(h / t)
+        regular = gamma1 * growth + gamma2 * t**delta * expm1(delta * growth)
+        from_zero = _infinite(gamma1) + gamma2 * jnp.where(singular, h, 1) ** delta
+        return jnp.where(singular & (h != 0), from_zero, regular)
+
+    def rate(self, t: Time) -> Scalar:
+        singular, t, gamma1, gamma2, delta = self._parameters(t)
+        regular = gamma1 / t + gamma2 * delta * t ** (delta - 1)
+        infinite = _infinite(jnp.where(gamma1 == 0, gamma2 * delta, gamma1))
+        return jnp.where(singular, infinite, regular)
+
+    @property
+    def strength(self) -> Scalar:
+        return self.gamma1  # the power is weaker
+
+    def is_singular(self, t: Time) -> Bool[Array, ""] | None:
+        return self._parameters(t)[0]
+
+
+class CallableDamping(AbstractDamping):
+    """Any function `eta(t)` as a damping; its increments are plain differences."""
+
+    eta: Callable
+
+    def __call__(self, t: Time) -> Scalar:
+        return cast_to(self.eta(t), t)
+
+    def increment(self, t: Time, h: Time) -> Scalar:
+        return self(t + h) - self(t)
+
+    def rate(self, t: Time) -> Scalar:
+        t = as_time(t)
+        return jax.jvp(self, (t,), (jnp.ones_like(t),))[1]
+
+
+class ScaledDamping(AbstractDamping):
+    """A law times a number: half of the friction, for the frame that positions and
+    momenta share."""
+
+    law: AbstractDamping
+    factor: float
+
+    def __call__(self, t: Time) -> Scalar:
+        return self.factor * self.law(t)
+
+    def increment(self, t: Time, h: Time) -> Scalar:
+        return self.factor * self.law.increment(t, h)
+
+    def rate(self, t: Time) -> Scalar:
+        return self.factor * self.law.rate(t)
+
+
+def as_damping(damping, name: str) -> AbstractDamping:
+    if isinstance(damping, AbstractDamping):
+        return damping
+    if callable(damping):
+        return CallableDamping(damping)
+    raise ValueError(
+        f"{name} must be a damping law or a function eta(t), but got {damping!r}. For "
+        "friction at a constant rate write `ConstantDamping(rate)`."
+    )

@@ -1,0 +1,59 @@
+from typing import Generic, Literal, TypeVar
+
+import optimistix as optx
+
+from .._misc import AbstractVar, check_root_finder
+from .._system import System
+from ._base import AbstractMoveSolver
+from ._engine import Stages
+from ._moves import frozen_drift, frozen_kick, root_find, RootFind
+
+
+_Carry = TypeVar("_Carry")
+
+
+class AbstractFrozenSolver(AbstractMoveSolver[_Carry], Generic[_Carry]):
+    """A scheme made of the two half-steps of the paper, adjoint to each other.
+
+    Momentum first is a kick at `t`, then a drift to `t + h` with the velocity frozen at
+    `t`: equation (presymp_euler), A in the design of the schemes. Position first is a
+    drift with the velocity frozen at `t + h`, then a kick there: equation
+    (presymp_euler2), or B. Both are explicit for a separable system, and implicit in
+    their first move for any other.
+    """
+
+    first: AbstractVar[Literal["momentum", "position"]]
+    root_finder: AbstractVar[optx.AbstractRootFinder | None]
+    root_find_max_steps: AbstractVar[int]
+
+    def __check_init__(self):
+        if self.first not in ("momentum", "position"):
+            raise ValueError(
+                f'`first` must be "momentum" or "position", but got {self.first!r}.'
+            )
+        if self.root_finder is not None:
+            check_root_finder(self.root_finder)
+
+    def momentum_first(self, system: System, known: bool = False) -> Stages:
+        """A, of which the force may be known. Its inverse is B, position first."""
+        find = self._find(system)
+        moves = frozen_kick(find, known), frozen_drift(find)
+        return Stages(moves, [(0, 0, 1), (0, 1, 1)])
+
+    def _find(self, system: System) -> RootFind:
+        if self.root_finder is None and not system.is_separable:
+            if system.split("any") is None:
+                instead = (
+                    "use `PresymplecticCoupled()`, which is explicit; or, if the "
+                    "energy is a sum T(t, p) + V(t, q), give its parts: "
+                    "`SeparableHamiltonian(kinetic, potential)` or "
+                    "`ConformalHamiltonian(kinetic, potential, damping)`."
+                )
+            else:
+                instead = "use `Strang()` or `BlanesMoan4()`, which are explicit."
+            raise ValueError(
+                f"This `{system.name}` is not separable, so `{type(self).__name__}` is "
+                "implicit. Pass it a root finder, for example "
+                "`root_finder=optimistix.Newton(rtol=1e-10, atol=1e-10)`; or " + instead
+            )
+        return root_find(self.root_finder, self.root_find_max_steps)

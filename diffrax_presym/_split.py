@@ -1,0 +1,158 @@
+"""Splits: the pairs of exact moves that the motion of a system may be made of.
+
+A Hamiltonian offers those that its energy allows, and a scheme asks for one by kind:
+
+- `"separable"`: neither does the velocity depend on `q`, nor the force on `p`;
+- `"any"`: a drift, which is the exact flow of one part, and a kick by the other;
+- `"nystrom"`: as any, and the part that flows is quadratic, so that the commutator
+  [kick, [kick, [kick, drift]]] vanishes (Runge--Kutta--Nyström methods rely on it);
+- `"shared"`: a second-order equation, with the friction turned into a force.
+
+The moves act on a pair of variables, mostly `(q, p)`: a drift takes time along, and a
+kick adds to the second of the pair.
+"""
+
+import abc
+from typing import TYPE_CHECKING, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Inexact, PyTree
+
+from ._friction._base import Time
+from ._friction._damping import ScaledDamping
+from ._misc import AbstractVar
+
+
+if TYPE_CHECKING:
+    from ._hamiltonian import QuadraticKinetic
+    from ._system import System
+
+
+State: TypeAlias = tuple[PyTree[Inexact[Array, "..."]], PyTree[Inexact[Array, "..."]]]
+
+
+class AbstractSplit(eqx.Module):
+    """Two exact moves, in variables of their own."""
+
+    kinds: AbstractVar[frozenset[str]]
+
+    @abc.abstractmethod
+    def to_split(self, system: "System", t: Time, y: State) -> State:
+        """The variables of the split, from `(q, p)`."""
+
+    @abc.abstractmethod
+    def from_split(self, system: "System", t: Time, z: State) -> State:
+        """The inverse of `to_split`."""
+
+    @abc.abstractmethod
+    def drift(self, system: "System", t: Time, h: Time, z: State, order: int) -> State:
+        """The flow of one part from `t` to `t + h`, friction included.
+
+        Exact where it is known in closed form, and else to the given order in `h`.
+        """
+
+    @abc.abstractmethod
+    def force(self, system: "System", t: Time, z: State) -> PyTree:
+        """The rate of change of the second variable during a kick."""
+
+
+class KineticSplit(AbstractSplit):
+    """The drift is the flow of the kinetic part, and the potential kicks."""
+
+    kinds: frozenset[str] = eqx.field(static=True)
+
+    def __init__(self, separable: bool, nystrom: bool):
+        names = {"any": True, "separable": separable, "nystrom": nystrom}
+        self.kinds = frozenset(name for name, holds in names.items() if holds)
+
+    def to_split(self, system: "System", t: Time, y: State) -> State:
+        return y
+
+    def from_split(self, system: "System", t: Time, z: State) -> State:
+        return z
+
+    def drift(self, system: "System", t: Time, h: Time, z: State, order: int) -> State:
+        return system.drift(t, h, z, order)
+
+    def force(self, system: "System", t: Time, z: State) -> PyTree:
+        return system.potential_force(t, z)
+
+
+class PotentialSplit(AbstractSplit):
+    """The drift is the flow of a quadratic potential, and the velocity kicks `q`.
+
+    Positions and momenta in swapped roles.
+    """
+
+    @property
+    def kinds(self) -> frozenset[str]:
+        return frozenset({"any", "nystrom"})
+
+    def to_split(self, system: "System", t: Time, y: State) -> State:
+        q, p = y
+        return p, q
+
+    def from_split(self, system: "System", t: Time, z: State) -> State:
+        p, q = z
+        return q, p
+
+    def drift(self, system: "System", t: Time, h: Time, z: State, order: int) -> State:
+        p, q = z
+        force = system.potential_force(t, (q, p))
+        if system.friction is None:
+            return system.add(p, h, force), q
+        gained = system.friction.respond(t, h, force, order)
+        return system.add(system.move_frame(t, h, p), 1, gained), q
+
+    def force(self, system: "System", t: Time, z: State) -> PyTree:
+        p, q = z
+        return system.velocity(t, (q, p))
+
+
+class SharedSplit(AbstractSplit):
+    r"""Half of the friction on positions and half on momenta, of which a force is left.
+
+    With $q = e^{-\eta / 2} x$ the motion is
+    $M x'' = e^{\eta / 2} F + (\eta'^2 / 4 + \eta'' / 2) M x$. The pair is $q$ and
+    $p + \eta' M q / 2$, which are $e^{-\eta / 2}$ times $x$ and $M x'$.
+    """
+
+    kinetic: "QuadraticKinetic"
+
+    @property
+    def kinds(self) -> frozenset[str]:
+        return frozenset({"shared"})
+
+    def _half(self, system: "System") -> ScaledDamping | None:
+        return None if system.friction is None else ScaledDamping(system.friction, 0.5)
+
+    def _momentum(self, system: "System", q: PyTree) -> PyTree:
+        return self.kinetic.momentum(system.values(q))
+
+    def _shift(self, system: "System", t: Time, y: State, sign: int) -> State:
+        (q, p), half = y, self._half(system)
+        if half is None:
+            return y
+        return q, system.add(p, sign * half.rate(t), self._momentum(system, q))
+
+    def to_split(self, system: "System", t: Time, y: State) -> State:
+        return self._shift(system, t, y, 1)
+
+    def from_split(self, system: "System", t: Time, z: State) -> State:
+        return self._shift(system, t, z, -1)
+
+    def drift(self, system: "System", t: Time, h: Time, z: State, order: int) -> State:
+        (q, p), half = z, self._half(system)
+        z = system.add(q, h, system.velocity(t, z)), p
+        if half is None:
+            return z
+        return system.add(z, 1, half.decay(t, h, system.values(z)))
+
+    def force(self, system: "System", t: Time, z: State) -> PyTree:
+        force, half = system.potential_force(t, z), self._half(system)
+        if half is None:
+            return force
+        rate, change = jax.jvp(half.rate, (t,), (jnp.ones_like(t),))
+        return system.add(force, rate**2 + change, self._momentum(system, z[0]))

@@ -1,0 +1,240 @@
+"""`Compensated` and `Checked` around every scheme, and in any nesting."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from helpers import (
+    ANY,
+    assert_close,
+    each,
+    henon_heiles,
+    IMPLICIT,
+    mixed_energy,
+    oscillator,
+    Scheme,
+    SCHEMES,
+    solve,
+    step,
+)
+
+import diffrax_presym as dps
+
+
+Y0 = (jnp.array([0.3, -0.2]), jnp.array([0.1, 0.4]))
+DAMPED = dps.ConformalHamiltonian(
+    dps.QuadraticKinetic(), henon_heiles, dps.LogDamping(1.0, shift=1.0)
+)
+NONSEPARABLE = dps.ConformalHamiltonian(
+    energy=mixed_energy, damping=dps.ConstantDamping(0.3)
+)
+T0, T1 = 0.5, 0.6
+WRAPPERS = {
+    "compensated": dps.Compensated,
+    "checked": dps.Checked,
+    "both": lambda solver: dps.Checked(dps.Compensated(solver)),
+    "other order": lambda solver: dps.Compensated(dps.Checked(solver)),
+}
+wrappers = pytest.mark.parametrize("wrap", WRAPPERS.values(), ids=WRAPPERS)
+_finder = optx.Newton(rtol=1e-12, atol=1e-12)
+
+
+def one_step(solver, hamiltonian=DAMPED):
+    return step(hamiltonian, solver, T0, T1, Y0)[0]
+
+
+@pytest.mark.parametrize("wrap", [WRAPPERS["both"]], ids=["both"])
+@each()
+def test_a_wrapped_step_is_the_step(scheme: Scheme, wrap):
+    expected = one_step(scheme.solver)
+    assert_close(one_step(wrap(scheme.solver)), expected, 1e-15)
+
+
+@wrappers
+@pytest.mark.parametrize("kind", ["tao_fixed", "coupled_4", "leapfrog_AB", "strang"])
+def test_any_nesting_of_wrappers(wrap, kind):
+    (scheme,) = (scheme for scheme in SCHEMES if scheme.name == kind)
+    expected = one_step(scheme.solver)
+    assert_close(one_step(wrap(scheme.solver)), expected, 1e-15)
+
+
+@each([s for s in SCHEMES if s.kind in ANY] + IMPLICIT)
+def test_wrappers_of_schemes_for_any_energy(scheme: Scheme):
+    expected = one_step(scheme.solver, NONSEPARABLE)
+    wrapped = dps.Checked(dps.Compensated(scheme.solver))
+    tolerance = 1e-10 if scheme in IMPLICIT else 1e-15
+    assert_close(one_step(wrapped, NONSEPARABLE), expected, tolerance)
+
+
+@wrappers
+@pytest.mark.parametrize(
+    "compose",
+    [dps.Suzuki4, lambda base: dps.Substeps(base, 3)],
+    ids=["composition", "substeps"],
+)
+def test_wrappers_inside_compositions(wrap, compose):
+    for base in (dps.PresymplecticLeapfrog(), dps.PresymplecticTao(5.0)):
+        expected = one_step(compose(base))
+        assert_close(one_step(compose(wrap(base))), expected, 1e-15)
+        assert_close(one_step(wrap(compose(base))), expected, 1e-15)
+
+
+@wrappers
+def test_wrappers_keep_what_the_scheme_has(wrap):
+    euler = wrap(dps.PresymplecticEuler())
+    assert not euler.is_symmetric and euler.reverse is not None
+    assert wrap(dps.PresymplecticLeapfrog()).is_symmetric
+    assert wrap(dps.PresymplecticProjected()).reverse is None
+    assert wrap(dps.TunedRKN6()).order(None) == 6
+    with pytest.raises(ValueError, match="keeps its order only for a kinetic energy"):
+        quartic = dps.SeparableHamiltonian(
+            lambda t, p, args: jnp.sum(p**4), henon_heiles
+        )
+        one_step(wrap(dps.TunedRKN6()), quartic)
+
+
+@wrappers
+@pytest.mark.parametrize(
+    "base",
+    [dps.PresymplecticTao(), dps.PresymplecticCoupled(), dps.PresymplecticEuler()],
+    ids=lambda base: type(base).__name__,
+)
+def test_compositions_refuse_through_wrappers(wrap, base):
+    for inside in (base, wrap(base), dps.Substeps(wrap(base), 2)):
+        with pytest.raises(ValueError, match=r"[cC]omposition|composes"):
+            dps.Suzuki4(inside)
+
+
+@wrappers
+@pytest.mark.parametrize(
+    "base",
+    [
+        dps.PresymplecticEuler("position"),
+        dps.PresymplecticTao(5.0),
+        dps.PresymplecticCoupled(4),
+        dps.BlanesMoanRKN4(),
+        dps.TunedLinear8(),
+        dps.Splitting(dps.SplittingTableau(1, True, False, (0.3, 0.5, 0.7, 0.5, 0.0))),
+    ],
+    ids=lambda base: type(base).__name__,
+)
+def test_the_adjoint_method_undoes_a_step(wrap, base):
+    solver = wrap(base)
+    term = dps.HamiltonianTerm(DAMPED)
+    t0, t1 = jnp.array(T0), jnp.array(T1)
+
+    @jax.jit
+    def there_and_back(y):
+        carry = solver.init(term, t0, t1, y, None)
+        y1, _, _, there, _ = solver.step(term, t0, t1, y, None, carry, False)
+        back = solver.reverse
+        y2, _, _, again, _ = back.step(term, t1, t0, y1, None, there, False)
+        return (y2, again), carry
+
+    (y, again), carry = there_and_back(Y0)
+    assert_close(y, Y0, 1e-15)
+    assert_close(again, carry, 1e-14)
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [
+        dps.PresymplecticEuler(),
+        dps.Checked(dps.PresymplecticEuler()),
+        dps.Compensated(dps.PresymplecticTao(5.0)),
+        dps.Checked(dps.Compensated(dps.Suzuki4())),
+        dps.Suzuki4(dps.Compensated(dps.PresymplecticLeapfrog())),
+    ],
+    ids=str,
+)
+def test_gradients_by_reversal_through_wrappers(solver):
+    def loss(y0, adjoint):
+        sol = dfx.diffeqsolve(
+            dps.HamiltonianTerm(DAMPED), solver, 0.5, 1.5, 0.125, y0, adjoint=adjoint
+        )
+        assert sol.ys is not None
+        return jnp.sum(jnp.sin(sol.ys[0])) + jnp.sum(sol.ys[1] ** 2)
+
+    by_reversal, by_checkpoints = (
+        jax.grad(loss)(Y0, adjoint)
+        for adjoint in (dps.ReversibleAdjoint(), dfx.RecursiveCheckpointAdjoint())
+    )
+    assert_close(by_reversal, by_checkpoints, 1e-13)
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [
+        dps.PresymplecticLeapfrog(),
+        dps.Suzuki4(),
+        dps.PresymplecticTao(5.0),
+        dps.PresymplecticCoupled(4),
+        dps.PresymplecticMidpoint(_finder),
+    ],
+    ids=lambda solver: type(solver).__name__,
+)
+def test_compensation_saves_digits(solver):
+    # The errors of rounding alone: the same steps in double precision are the truth.
+    undamped = dps.SeparableHamiltonian(dps.QuadraticKinetic(), henon_heiles)
+    half = 1.0 if isinstance(solver, dps.PresymplecticMidpoint) else 4.0
+
+    def end(solver, dtype):
+        y0 = jax.tree.map(lambda x: x.astype(dtype), Y0)
+        times = (jnp.asarray(x, dtype) for x in (0.0, 64.0 * half, 2.0**-5))
+        sol = solve(undamped, solver, *times, y0, max_steps=2**14)
+        return np.concatenate([np.asarray(y[-1], np.float64) for y in sol.ys])
+
+    if isinstance(solver, dps.PresymplecticMidpoint):
+        loose = optx.Newton(rtol=1e-6, atol=1e-7)
+        solver32, solver64 = dps.PresymplecticMidpoint(loose), solver
+    else:
+        solver32 = solver64 = solver
+    exact = end(solver64, jnp.float64)
+    plain = np.max(np.abs(end(solver32, jnp.float32) - exact))
+    compensated = end(dps.Compensated(solver32), jnp.float32)
+    assert np.max(np.abs(compensated - exact)) < plain / 3
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        dps.Suzuki4,
+        lambda base: dps.Substeps(base, 2),
+        dfx.HalfSolver,
+    ],
+    ids=["composition", "substeps", "half steps"],
+)
+def test_steps_of_nominal_length_inside_others(wrap):
+    # Times in single precision do not tell half of a step from a step at t = 1.5e4.
+    t0, h, steps = 1.5e4, 2.0**-7, 64
+    y0 = (jnp.array([1.0], jnp.float32), jnp.array([0.0], jnp.float32))
+    base = dps.Compensated(dps.PresymplecticLeapfrog(), length=h)
+    times = (jnp.asarray(t, jnp.float32) for t in (t0, t0 + steps * h, h))
+    sol = solve(oscillator(0.0), wrap(base), *times, y0)
+    assert sol.ys is not None
+    end = np.array([y[-1, 0] for y in sol.ys])
+    np.testing.assert_allclose(end, [np.cos(steps * h), -np.sin(steps * h)], atol=2e-4)
+
+
+def test_the_distance_of_copies_through_wrappers():
+    saveat = dfx.SaveAt(t1=True, solver_state=True)
+    for base in (dps.PresymplecticCoupled(2), dps.PresymplecticTao(5.0)):
+        distances = []
+        for solver in (base, dps.Checked(dps.Compensated(base))):
+            sol = solve(NONSEPARABLE, solver, 0.0, 1.0, 0.125, Y0, saveat=saveat)
+            end = jax.tree.map(lambda y: y[-1], sol.ys)
+            distance = dps.diagnostics.copy_distance(solver, end, sol.solver_state)
+            distances.append(float(distance))
+        assert distances[0] > 1e-6
+        np.testing.assert_allclose(distances[1], distances[0], rtol=1e-9)
+
+
+def test_checked_fails_where_the_state_is_not_finite():
+    blow = dps.SeparableHamiltonian(
+        dps.QuadraticKinetic(), lambda t, q, a: jnp.sum(q**8)
+    )
+    solver = dps.Suzuki4(dps.Checked(dps.PresymplecticLeapfrog()))
+    sol = solve(blow, solver, 0.0, 10.0, 2.0, (1e2 * Y0[0], Y0[1]), throw=False)
+    assert sol.result != dfx.RESULTS.successful
