@@ -263,7 +263,8 @@ def main():
                 f"{name}: loss at T = {temperatures[shown]:.2f}",
                 says,
                 f"{curve[0]:.3f} after {every} iterations, {final:.3f} at the end; "
-                f"reaches the final loss of gradient descent {reached(curve, best, every)}",
+                "reaches the final loss of gradient descent "
+                f"{reached(curve, best, every)}",
             )
         )
     for name, (energies, heat_capacities) in observed.items():
