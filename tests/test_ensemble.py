@@ -85,4 +85,4 @@ def test_processes_end_at_the_limit(tmp_path):
     # It returns only when all have ended that could write to its output.
     code, output, _ = run(tmp_path, *options, limit=100)
     assert code == 1
-    assert "Picture" not in output
+    assert "Figure" not in output

@@ -38,7 +38,7 @@ def report(name, fig, rows, options) -> None:
     fig.savefig(path, dpi=100)
     # A palette is sufficient for line plots, and takes a third of the space.
     Image.open(path).quantize(256).save(path, optimize=True)
-    print(f"\nPicture saved to {path}\n")
+    print(f"\nFigure saved to {path}\n")
     for what, paper, measured in rows:
         print(f"{what}\n    paper says  {paper}\n    we measure  {measured}")
     if options.docs:
