@@ -1,7 +1,7 @@
-"""What this package relies on in Diffrax without a promise, one sentence each.
+"""Undocumented behaviour of Diffrax that this package relies on.
 
-Should one of these fail after an update of Diffrax, nothing else need be wrong: mend
-`diffrax_presym/_term.py` or `diffrax_presym/_solver/_base.py` accordingly.
+If one of these tests fails after an update of Diffrax, adapt `diffrax_presym/_term.py`
+or `diffrax_presym/_solver/_base.py` accordingly.
 """
 
 from typing import ClassVar
@@ -22,7 +22,7 @@ Y0 = (jnp.ones(1), jnp.ones(1))
 
 
 class Recorder(dfx.AbstractSolver):
-    """Diffrax's own Euler method, which writes down what it is called with."""
+    """Euler's method, which records its arguments."""
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar = dfx.LocalLinearInterpolation
@@ -118,7 +118,7 @@ def test_the_term_of_backsolve_adjoint_is_called_adjoint_term():
 
 
 class Interpolation(dfx.AbstractLocalInterpolation):
-    """One that takes whatever it is given, and writes it down."""
+    """An interpolation that accepts and records any arguments."""
 
     t0: jax.Array
     t1: jax.Array
@@ -137,7 +137,7 @@ class Interpolating(Recorder):
     built: ClassVar[list] = []
 
 
-# Within the loop, and by what a solution of dense output does after it.
+# Within the loop, and in dense output after it.
 @pytest.mark.parametrize("saveat", [dict(ts=jnp.array([-0.5])), dict(dense=True)])
 def test_interpolations_are_made_of_times_and_dense_info(saveat):
     Interpolating.built.clear()
@@ -168,7 +168,7 @@ def test_times_are_arrays_of_one_precision(call):
             times.extend((t0, t1) if call == "step" else ())
             return super().step(terms, t0, t1, *args)
 
-    # Of Python numbers of several kinds, an integer too.
+    # From Python numbers of several types, including an integer.
     run = lambda: dfx.diffeqsolve(TERM, Clock(), 0, 1.0, 0.1, Y0).ys
     eqx.filter_eval_shape(run)
     assert times and all(isinstance(t, jax.Array) for t in times), (
