@@ -55,9 +55,9 @@ def test_the_term_arrives_in_a_wrapper_with_term_and_direction(call):
     wrapped = record()[call]
     assert not isinstance(wrapped, dps.HamiltonianTerm) and isinstance(
         getattr(wrapped, "term", None), dps.HamiltonianTerm
-    ), "`diffeqsolve` no longer hands a solver its term in a wrapper with `.term`."
+    ), "`diffeqsolve` no longer passes the term in a wrapper with `.term`."
     assert eqx.is_array(getattr(wrapped, "direction", None)), (
-        "The wrapper of a term no longer has `.direction`, the sign of time."
+        "The wrapper of a term no longer has a `.direction`, the sign of time."
     )
 
 
@@ -72,14 +72,14 @@ def test_direction_is_the_sign_of_time(t1, sign):
     assert sol.ys is not None
     direction, end = sol.ys
     assert direction == sign and end == abs(t1), (
-        "The wrapper's `.direction` is no longer 1 or -1, by which time is multiplied."
+        "The wrapper's `.direction` is no longer 1 or -1, a factor of the time."
     )
 
 
 def test_made_jump_is_false_under_constant_step_sizes():
     assert record()["made_jump"] is False, (
-        "`made_jump` is no longer the Python value `False` under `ConstantStepSize`: a "
-        "branch is traced, and the carried force kept for nothing."
+        "`made_jump` is no longer the Python value `False` under `ConstantStepSize`: an "
+        "unnecessary branch is traced."
     )
 
 
@@ -112,8 +112,8 @@ def test_the_term_of_backsolve_adjoint_is_called_adjoint_term():
     eqx.filter_eval_shape(gradient, Y0)
     inner = getattr(recorder.seen["init"], "term", recorder.seen["init"])
     assert type(inner).__name__ == "AdjointTerm", (
-        "`BacksolveAdjoint` no longer solves an `AdjointTerm`, by whose name its users "
-        "are told what to write instead."
+        "`BacksolveAdjoint` no longer solves an `AdjointTerm`, by whose name it is "
+        "detected for an error message."
     )
 
 
@@ -148,11 +148,11 @@ def test_interpolations_are_made_of_times_and_dense_info(saveat):
         return sol.evaluate(-0.5) if saved.dense else sol.ys
 
     eqx.filter_eval_shape(run)
-    assert Interpolating.built, "`interpolation_cls` is no longer what is called."
+    assert Interpolating.built, "`interpolation_cls` is no longer called."
     for args, kwargs in Interpolating.built:
         assert not args and set(kwargs) == {"t0", "t1", "y0", "y1"}, (
             "`interpolation_cls` is no longer called with `t0`, `t1` and the entries "
-            "of `dense_info`, all by name."
+            "of `dense_info` as keyword arguments."
         )
 
 
@@ -172,9 +172,9 @@ def test_times_are_arrays_of_one_precision(call):
     run = lambda: dfx.diffeqsolve(TERM, Clock(), 0, 1.0, 0.1, Y0).ys
     eqx.filter_eval_shape(run)
     assert times and all(isinstance(t, jax.Array) for t in times), (
-        "A solver is no longer given times that are arrays: Python numbers would be "
-        "upcast, and have no `.dtype`."
+        "Times are no longer passed to a solver as arrays: Python numbers would be "
+        "promoted, and have no `.dtype`."
     )
     assert {(t.shape, t.dtype) for t in times} == {((), jnp.dtype("float64"))}, (
-        "A solver is no longer given times of one floating precision."
+        "Times are no longer passed to a solver in one floating-point precision."
     )

@@ -322,8 +322,8 @@ def test_where_a_solver_state_belongs(solver):
     stale = let_go(solver, t, START[1], tuple(y), solver_state=carry)
     assert np.max(np.abs(flat(ending(stale)) - flat(ending(fresh)))) > 1e-4
     # With `made_jump` the solver state is recomputed.
-    mended = let_go(solver, t, START[1], tuple(y), solver_state=carry, made_jump=True)
-    assert_close(ending(mended), ending(fresh), 1e-14)
+    renewed = let_go(solver, t, START[1], tuple(y), solver_state=carry, made_jump=True)
+    assert_close(ending(renewed), ending(fresh), 1e-14)
 
 
 def test_nothing_is_saved_after_the_event():
