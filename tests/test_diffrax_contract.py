@@ -78,8 +78,8 @@ def test_direction_is_the_sign_of_time(t1, sign):
 
 def test_made_jump_is_false_under_constant_step_sizes():
     assert record()["made_jump"] is False, (
-        "`made_jump` is no longer the Python value `False` under `ConstantStepSize`: an "
-        "unnecessary branch is traced."
+        "`made_jump` is no longer the Python value `False` under `ConstantStepSize`: "
+        "an unnecessary branch is traced."
     )
 
 
