@@ -1,5 +1,5 @@
-# Every target sets up what it needs, in `.venv`, on a machine that has GNU make and
-# Python 3.11 or newer. `make help` lists them.
+# Every target installs its dependencies into `.venv`. GNU make and Python 3.11 or newer
+# are required. `make help` lists the targets.
 
 # To choose the interpreter: `make PYTHON=/path/to/python test`.
 PYTHON ?=
@@ -7,7 +7,7 @@ VENV := .venv
 OLDEST := .venv-oldest
 BIN := $(VENV)/bin
 PIP := -m pip --quiet --disable-pip-version-check install
-# Two processes: what a small machine has. `make test WORKERS=auto` takes all there are.
+# Number of test processes. `make test WORKERS=auto` uses all cores.
 WORKERS ?= 2
 PYTEST = -m pytest -q -n $(WORKERS) --dist worksteal
 
@@ -17,12 +17,12 @@ PAPER := $(notdir $(basename $(filter-out examples/paper/_%,$(wildcard examples/
 BENCHMARKS := against_loop compile_time schemes tuning work_precision batches nonseparable \
 	hard_cases gradients
 
-# No window is ever opened: figures go to files.
+# Figures are saved to files, without a display.
 export MPLBACKEND ?= Agg
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test slow oldest lint format docs serve tutorials examples paper bench clean
-# The targets share one environment, so never two at a time.
+# The targets share one environment, so they must not run in parallel.
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
 
@@ -30,20 +30,20 @@ help:  ## List the targets
 	@sed -n 's/^\([a-z]*\):.*##  *\(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) \
 		| while IFS='|' read -r name text; do printf '%-16s %s\n' "$$name" "$$text"; done
 
-demo: $(VENV)/.with-examples  ## Print the quick start's table and save its picture
+demo: $(VENV)/.with-examples  ## Run the quick start: print its tables and save its figure
 	@$(BIN)/python examples/quickstart.py
 
-test: $(VENV)/.with-tests  ## Run the tests, but for the slowest
+test: $(VENV)/.with-tests  ## Run the tests, except the slow ones
 	@$(BIN)/python $(PYTEST) -m "not slow"
 
-slow: $(VENV)/.with-tests  ## Run the slowest tests: gradients, and more of the same
+slow: $(VENV)/.with-tests  ## Run the slow tests
 	@$(BIN)/python $(PYTEST) -m slow
 
-# All that the documentation shows, which is a little of everything, and the loop over
-# stages, which takes JAX's programs apart; all tests of this by `make oldest TESTS=tests`.
-# Old versions warn of each other, which is not our concern.
+# By default the code of the documentation, which covers most features, and the loop over
+# stages, which relies on JAX internals. `make oldest TESTS=tests` runs all tests.
+# Deprecation warnings between old versions are ignored.
 oldest: TESTS ?= tests/test_docs.py tests/test_stages.py
-oldest: $(OLDEST)/.installed  ## Run the documentation with the oldest dependencies
+oldest: $(OLDEST)/.installed  ## Test the documentation with the oldest dependencies
 	@$(OLDEST)/bin/python $(PYTEST) -W ignore::DeprecationWarning $(TESTS)
 
 lint: $(VENV)/.with-lint  ## Check style and types
@@ -51,7 +51,7 @@ lint: $(VENV)/.with-lint  ## Check style and types
 	@$(BIN)/ruff format --check
 	@$(BIN)/pyright --pythonpath $(BIN)/python
 
-format: $(VENV)/.with-lint  ## Mend the style where it can be mended
+format: $(VENV)/.with-lint  ## Format the code and apply automatic fixes
 	@$(BIN)/ruff check --fix
 	@$(BIN)/ruff format
 
@@ -59,13 +59,13 @@ docs: $(VENV)/.with-docs  ## Build the documentation into site/
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs --quiet build --strict --clean
 	@echo "Documentation built: open site/index.html"
 
-serve: $(VENV)/.with-docs  ## Serve the documentation while you edit it
+serve: $(VENV)/.with-docs  ## Serve the documentation with live reload
 	@$(BIN)/mkdocs serve
 
-tutorials: $(VENV)/.with-examples  ## Run the tutorials, and draw their pictures
+tutorials: $(VENV)/.with-examples  ## Run the tutorials and save their figures
 	@$(BIN)/python docs/_tutorials.py
 
-examples: $(VENV)/.with-examples  ## Run every example, quickly
+examples: $(VENV)/.with-examples  ## Run a short version of every example
 	@set -e; for script in $(EXAMPLES); do \
 		echo "--- $$script --quick"; $(BIN)/python $$script --quick; \
 	done; \
@@ -73,7 +73,7 @@ examples: $(VENV)/.with-examples  ## Run every example, quickly
 		echo "--- $$name --quick"; $(BIN)/python -m examples.paper.$$name --quick; \
 	done
 
-paper: $(VENV)/.with-examples  ## Reproduce the paper: its figures, and a table of its claims
+paper: $(VENV)/.with-examples  ## Reproduce the figures and tables of the paper
 	@set -e; for name in $(PAPER); do \
 		echo "--- $$name"; $(BIN)/python -m examples.paper.$$name --docs; \
 	done
@@ -83,17 +83,17 @@ bench: $(VENV)/.with-benchmarks  ## Run every benchmark
 		echo "--- $$name"; $(BIN)/python benchmarks/$$name.py; \
 	done
 
-clean:  ## Remove the environments and everything that was built
+clean:  ## Remove the environments and all build outputs
 	@rm -rf $(VENV) $(OLDEST) site build dist .pytest_cache .ruff_cache *.egg-info
 	@find . -name __pycache__ -prune -exec rm -rf {} +
 
-# Once per set of extras, and again when the dependencies change.
+# Run once per set of extras, and again when the dependencies change.
 $(VENV)/.with-%: pyproject.toml | $(BIN)/pip
 	@echo "Installing diffrax_presym[$*] into $(VENV) ..."
 	@$(BIN)/python $(PIP) --editable '.[$*]'
 	@touch $@
 
-# A name on the path need not run: version managers leave stubs. So each is tried.
+# Each candidate is executed, since version managers may put stubs on the path.
 $(BIN)/pip:
 	@for python in $(or $(PYTHON),python3.13 python3.12 python3.11 python3); do \
 		if "$$python" -c 'import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))' \
@@ -103,10 +103,10 @@ $(BIN)/pip:
 		fi; \
 	done; \
 	echo "No usable Python found (tried: $(or $(PYTHON),python3.13 python3.12 python3.11 python3))." >&2; \
-	echo "Python 3.11 or newer is needed, with its venv module (on Debian and Ubuntu: apt-get install python3-venv). Name one by 'make PYTHON=/path/to/python ...'." >&2; \
+	echo "Python 3.11 or newer is needed, with its venv module (on Debian and Ubuntu: apt-get install python3-venv). Choose one with 'make PYTHON=/path/to/python ...'." >&2; \
 	exit 1
 
-# The versions that the lower bounds in `pyproject.toml` allow, not those of today.
+# The lowest versions that `pyproject.toml` allows.
 $(OLDEST)/.installed: pyproject.toml | $(BIN)/pip
 	@echo "Installing the oldest allowed dependencies into $(OLDEST) ..."
 	@$(BIN)/python $(PIP) uv

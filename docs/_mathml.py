@@ -1,7 +1,7 @@
-"""Formulas as MathML, which browsers draw by themselves: no script, font or network.
+"""Render formulas as MathML, which browsers support without scripts, fonts or network.
 
-Arithmatex marks the formulas, in pages and docstrings alike; this hook of MkDocs turns
-them into MathML when a page is built. A formula it cannot read fails the build.
+Arithmatex marks the formulas in pages and docstrings; this MkDocs hook converts them to
+MathML when a page is built. A formula that cannot be converted fails the build.
 """
 
 import html
@@ -27,7 +27,7 @@ def on_page_content(content, page, **kwargs):
             words = [x.text or "" for x in ElementTree.fromstring(formula).iter()]
         except Exception as e:
             raise PluginError(f"{page.file.src_uri}: cannot read ${latex}$: {e}") from e
-        # What the converter does not know it copies as it is.
+        # The converter copies unknown commands unchanged.
         unknown = [word for word in words if "\\" in word]
         if unknown:
             raise PluginError(

@@ -1,7 +1,7 @@
-"""Run the tutorials as they are written, so that their pictures are what they draw.
+"""Run the code blocks of the tutorials and save their figures.
 
-The blocks of each page are run one after another, each page in a process of its own,
-with `docs/img` as the working directory. What a page prints is printed.
+The blocks of each page are run in order, in a separate process for each page, with
+`docs/img` as the working directory. Output is printed.
 
     python docs/_tutorials.py [pendulum ...]
 """

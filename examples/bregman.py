@@ -1,8 +1,8 @@
-"""Rates of convergence of Bregman dynamics, and that the discrete motion keeps them.
+"""Rates of convergence of Bregman dynamics, and their preservation by the schemes.
 
-Prints the slope of f - f* against time for polynomial and exponential scalings, beside
-what theory says, and the difference between discrete and continuous motion against the
-step. Saves one picture. `--quick` runs a smaller version of all of it.
+Prints the slope of f - f* against time for polynomial and exponential scalings, with
+the theoretical values, and the difference between discrete and continuous solution
+against the step size. Saves one figure. `--quick` runs a smaller version.
 """
 
 import argparse
@@ -23,17 +23,17 @@ import matplotlib.pyplot as plt
 
 jax.config.update("jax_enable_x64", True)
 
-# The labelled points of a classification, each times its label: a line separates them.
+# The points of a classification, multiplied by their labels; linearly separable.
 POINTS = jnp.array(np.random.default_rng(0).normal(size=(12, 2)) / 2 + [2.0, 1.0])
 
 
 def exponential(t, q, args):
-    """The motion is known, q = beta(t), and with it f = exp(-beta), exactly."""
+    """The exact solution is q = beta(t), with f = exp(-beta)."""
     return jnp.sum(jnp.exp(-q))
 
 
 def logistic(t, q, args):
-    """Logistic regression, without a minimum: its infimum is zero."""
+    """Logistic regression. It has no minimum; its infimum is zero."""
     return jnp.mean(jnp.logaddexp(0.0, -POINTS @ q))
 
 
@@ -45,14 +45,14 @@ def uneven(t, q, args):
     return (q[0] ** 2 + 4 * q[1] ** 2) / 2 + jnp.sum(q**4) / 4
 
 
-# objective, initial position, and the exponent of t that theory knows, in units of c:
-# on the quadratic it is not the bound, -1, but that of the amplitude by WKB.
+# Objective, initial position, and the theoretical exponent of t in units of c. For the
+# quadratic it is not the bound, -1, but follows from the WKB amplitude.
 PROBLEMS = {
     "exponential": (exponential, jnp.array([0.5]), -1.0),
     "logistic": (logistic, jnp.zeros(2), -1.0),
     "quadratic": (quadratic, jnp.array([1.0]), -1.5),
 }
-# scaling, and the time at which exp(-beta) is about 1e-8
+# Scaling, and the time at which exp(-beta) is about 1e-8
 SCALINGS = {
     "c = 2": (dps.PolynomialScaling(2.0), 1e4),
     "c = 3": (dps.PolynomialScaling(3.0), 464.0),
@@ -68,7 +68,7 @@ SOLVERS = {
 
 
 def solve(objective, scaling, solver, q0, ts, substeps):
-    """The gap f - f* at the given times, with so many steps from each to the next."""
+    """The gap f - f* at the given times, with `substeps` steps between them."""
     hamiltonian = dps.BregmanHamiltonian(dps.EuclideanMirror(), objective, scaling)
     sol = dfx.diffeqsolve(
         dps.HamiltonianTerm(hamiltonian),
@@ -85,10 +85,10 @@ def solve(objective, scaling, solver, q0, ts, substeps):
 
 
 def fitted(x, gap):
-    """The slope of log gap, of its upper envelope, over the last two thirds of x."""
+    """The slope of the upper envelope of log gap, over the last two thirds of x."""
     chosen = x > x[0] + (x[-1] - x[0]) / 3
     x, log = x[chosen], np.log(gap[chosen])
-    # Of each of a few windows the largest value: a motion that swings has zeros.
+    # The largest value of each window, as an oscillating solution has zeros.
     windows = np.array_split(np.arange(len(x)), 12)
     top = [window[np.argmax(log[window])] for window in windows]
     return np.polyfit(x[top], log[top], 1)[0]
@@ -96,14 +96,14 @@ def fitted(x, gap):
 
 def rates(quick):
     print("Slope of log(f - f*) against log t, or t for the exponential scaling;")
-    print("in brackets what theory says\n")
+    print("theoretical values in brackets\n")
     print(f"{'scaling':14}" + "".join(f"{name:>22}" for name in PROBLEMS))
     curves = {}
     for scaling, (law, t1) in SCALINGS.items():
         exponential_rate = scaling == "exponential"
         row, c = f"{scaling:14}", float(law.c)
         for name, (objective, q0, exponent) in PROBLEMS.items():
-            # The frequency on the quadratic grows, so that it needs more steps.
+            # The frequency on the quadratic grows, so more steps are needed.
             last = t1**0.75 if quick or name == "quadratic" else t1
             if exponential_rate:
                 ts = jnp.linspace(0.0, last, 501)
@@ -120,7 +120,7 @@ def rates(quick):
 
 
 def convergence(quick):
-    """The discrete minus the continuous gap at t = 3, against the step."""
+    """The discrete minus the continuous gap at t = 3, against the step size."""
     q0, law = jnp.array([1.0, -0.5]), dps.PolynomialScaling(3.0)
     H = dps.BregmanHamiltonian(dps.EuclideanMirror(), uneven, law)
 
@@ -192,7 +192,7 @@ def main():
     curves = rates(options.quick)
     ns, errors = convergence(options.quick)
     picture(options.output, curves, ns, errors)
-    print(f"\nPicture saved to {options.output}")
+    print(f"\nFigure saved to {options.output}")
 
 
 if __name__ == "__main__":

@@ -1,14 +1,14 @@
-"""Throw a ball through thick air to a given place, with the least speed.
+"""Throw a ball with air friction to a given target, with the least initial speed.
 
-How fast must a ball be thrown, at some angle, to land on a target? This is a shooting
-problem. The flight ends in an event, when the ball comes down to the ground, and the
-derivative through the event lets Newton's method bring the place of landing to the
-target. At which angle is that speed least? Where the place of landing has no slope in
-the angle: one more equation, on second derivatives through the event. The air grows
-thicker from case to case, each of which starts from the solution of the last.
+At a given angle, the speed at which the ball lands on the target is the solution of a
+shooting problem. The flight is terminated by an event, when the ball reaches the
+ground, and Newton's method differentiates through the event. At the optimal angle the
+derivative of the landing position in the angle vanishes, which is a second equation,
+with second derivatives through the event. The friction increases from case to case,
+each of which starts from the solution of the previous one.
 
-The derivatives are checked against differences. The flights are checked against the
-exact solution, which there is for this problem, and which nothing else needs.
+The derivatives are checked against finite differences, and the trajectories against
+the exact solution.
 
     python examples/control.py [--quick] [--output control.png]
 """
@@ -28,7 +28,7 @@ import diffrax_presym as dps
 
 jax.config.update("jax_enable_x64", True)
 
-# In metres and seconds. The ball leaves the hand two metres above the ground.
+# In metres and seconds. The ball is thrown from two metres above the ground.
 GRAVITY, HAND, TARGET, STEP = 9.81, 2.0, 50.0, 0.1
 NEWTON = optx.Newton(rtol=1e-12, atol=1e-12)
 
@@ -47,13 +47,13 @@ def direction(angle):
 
 
 def throw(speed, angle, friction, adjoint, dense=False):
-    """The flight of a ball of mass one, to where it comes down."""
+    """The flight of a ball of unit mass, until it reaches the ground."""
     hamiltonian = dps.ConformalHamiltonian(
         dps.QuadraticKinetic(), potential, dps.ConstantDamping(friction)
     )
     return dfx.diffeqsolve(
         dps.HamiltonianTerm(hamiltonian),
-        # Of order six at the steps, and between them, where the event is found.
+        # Order six at the steps and between them, where the event is located.
         dps.BlanesMoanRKN6(),
         t0=0.0,
         t1=100.0,
@@ -73,32 +73,32 @@ def landing(speed, angle, friction, adjoint):
 
 @jax.jit
 def slopes(speed, angle, friction):
-    """The place of landing, and its derivatives by all there is, in reverse mode."""
-    # `dps.ReversibleAdjoint` refuses events.
+    """The landing position and its derivatives, in reverse mode."""
+    # `dps.ReversibleAdjoint` does not support events.
     by = jax.value_and_grad(landing, argnums=(0, 1, 2))
     return by(speed, angle, friction, dfx.RecursiveCheckpointAdjoint())
 
 
 def reach(log_speed, angle, friction):
-    """How far a ball flies, between logarithms: there it is nearly a straight line."""
+    """The logarithm of the range, which is nearly linear in the logarithm of speed."""
     place = landing(jnp.exp(log_speed), angle, friction, dfx.ForwardMode())
     return jnp.log(place / TARGET)
 
 
 @jax.jit
 def launch(angle, friction, guess):
-    """The speed at which a ball lands on the target."""
+    """The speed at which the ball lands on the target."""
     miss = lambda log_speed, _: reach(log_speed, angle, friction)
     return jnp.exp(optx.root_find(miss, NEWTON, jnp.log(guess)).value)
 
 
 @jax.jit
 def best(friction, angle, guess):
-    """The angle at which that speed is least, and the speed."""
+    """The angle at which this speed is minimal, and the speed."""
 
     def miss(unknown, _):
         log_speed, angle = unknown
-        # At this speed no other angle takes the ball further.
+        # At this speed, the range is maximal at this angle.
         by_angle = lambda angle: reach(log_speed, angle, friction)
         return jax.jvp(by_angle, (angle,), (jnp.ones_like(angle),))
 
@@ -108,7 +108,7 @@ def best(friction, angle, guess):
 
 @jax.jit
 def flight(speed, angle, friction):
-    """Times from the throw to the landing, and the places of the ball."""
+    """Times from the throw to the landing, and the positions of the ball."""
     sol = throw(speed, angle, friction, dfx.ForwardMode(), dense=True)
     assert sol.ts is not None
     ts = jnp.linspace(0, sol.ts[-1], 200)
@@ -116,14 +116,15 @@ def flight(speed, angle, friction):
 
 
 def exact(t, speed, angle, friction):
-    """Where the ball is, by the formula."""
+    """The position of the ball, by the exact solution."""
     reach = -np.expm1(-friction * t) / friction if friction else t
     drop = GRAVITY * ((t - reach) / friction if friction else t**2 / 2)
     return speed * reach * direction(angle) + np.array([0, HAND - drop])
 
 
 def check(*throw):
-    print("Derivatives of the place of landing: through the event, and by differences")
+    print("Derivatives of the landing position: ", end="")
+    print("through the event, by finite differences")
     for i, (name, slope) in enumerate(
         zip(("speed", "angle", "friction"), slopes(*throw)[1], strict=True)
     ):
@@ -141,12 +142,12 @@ def main():
 
     check(*np.array([25.0, 0.8, 0.3]))
 
-    print(f"\nThe least speeds that reach {TARGET:.0f} m")
-    print("friction, 1/s  angle, deg  speed, m/s  flight, s  off the formula, m")
+    print(f"\nMinimal speeds to reach {TARGET:.0f} m")
+    print("friction, 1/s  angle, deg  speed, m/s  flight, s    landing error, m")
     fig, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
     angles = np.radians(np.linspace(5, 75, number))
     target = np.array([TARGET, 0])
-    # Without air, and from the ground.
+    # The solution without friction, thrown from the ground.
     angle, speed = np.radians(45.0), np.sqrt(GRAVITY * TARGET)
     for friction in np.array(frictions):
         angle, speed = best(friction, angle, speed)

@@ -1,16 +1,16 @@
-"""An ensemble over all devices, and over processes: half a million pendulums at once.
+"""An ensemble over all devices and processes: half a million pendulums.
 
-Which minimum a damped pendulum settles in, for a grid of starting points that is split
-over every device there is. Prints that the split solve equals the solve on one device,
-and that its compiled program holds no communication; saves a picture.
+Computes the minimum in which a damped pendulum settles, for a grid of initial states
+that is split over all devices. Prints whether the result equals that of one device, and
+the communication in the compiled program; saves a figure.
 
     python examples/ensemble.py                 # the devices of this machine
-    python examples/ensemble.py --devices 8     # as if the CPU were eight devices
+    python examples/ensemble.py --devices 8     # the CPU as eight devices
     python examples/ensemble.py --processes 2   # two processes, on this machine
     srun python examples/ensemble.py --cluster  # one process per task of a cluster
 
-On machines of your own, start one process on each, with `--processes`, `--process-id`
-and the `--coordinator` that is process 0.
+On machines without a scheduler, start one process on each, with `--processes`,
+`--process-id`, and the address of process 0 as `--coordinator`.
 """
 
 import argparse
@@ -58,11 +58,11 @@ def pendulum():
 
 
 def solver_of(hamiltonian, solver, dt0=0.25, throw=False, **kwargs):
-    """The solve of one batch of starting points, from `y0` to the state at `T1`."""
+    """The solve of a batch of initial states, from `y0` to the state at `T1`."""
     term = dps.HamiltonianTerm(hamiltonian)
 
     def solve(y0):
-        # `throw=True` would ask all devices whether any of them failed.
+        # `throw=True` would check for failures across all devices.
         sol = dfx.diffeqsolve(
             term,
             solver,
@@ -86,8 +86,8 @@ def compiled(solve, sharding, y0):
 
 
 def collectives(program):
-    """The operations that make devices wait for each other: in loops, and outside."""
-    # Functions of the compiled program start at the margin, and name those they call.
+    """Counts of collective operations, in loops and outside of loops."""
+    # Functions of the compiled program are not indented, and name those they call.
     texts = {m[1]: m[0] for m in FUNCTION.finditer(program.as_text())}
     looping, todo = set(), []
     for text in texts.values():
@@ -112,19 +112,19 @@ def described(program):
 
 
 def starts(n):
-    """A grid of `n * n` starting points, the same on every process."""
+    """A grid of `n * n` initial states, the same on every process."""
     q0, p0 = np.meshgrid(np.linspace(-np.pi, np.pi, n), np.linspace(-8, 8, n))
     return q0.ravel(), p0.ravel()
 
 
 def split(y0, sharding):
-    """Arrays over all devices; a process makes only the parts of its own devices."""
+    """Arrays over all devices; a process creates only the parts of its own devices."""
     place = lambda x: jax.make_array_from_callback(x.shape, sharding, lambda i: x[i])
     return jax.tree.map(place, y0)
 
 
 def difference(ys, whole):
-    """The largest difference on the devices of this process, and whether any is."""
+    """The largest difference on the devices of this process, and bitwise equality."""
     largest, bitwise = 0.0, True
     for y, w in zip(ys, whole, strict=True):
         for shard in y.addressable_shards:
@@ -135,7 +135,7 @@ def difference(ys, whole):
 
 
 def patterns(sharding, y0):
-    """What keeps a solve free of communication, and what does not."""
+    """Print the communication of several kinds of solves."""
     leapfrog, tsit5 = dps.PresymplecticLeapfrog(), dfx.Tsit5()
     adapt: dict[str, Any] = dict(
         dt0=None, stepsize_controller=dfx.PIDController(rtol=1e-6, atol=1e-6)
@@ -147,7 +147,7 @@ def patterns(sharding, y0):
     event = dfx.Event(lambda t, y, args, **kwargs: y[0] > 100.0)
     hamiltonian = pendulum()
     adaptive = solver_of(hamiltonian, tsit5, **adapt)
-    # Each device runs a program of its own, whatever that is.
+    # Each device runs its own program.
     alone = lambda solve: jax.shard_map(
         solve,
         mesh=sharding.mesh,
@@ -182,7 +182,7 @@ def picture(path, n, q):
         interpolation="nearest",
     )
     ax.set(
-        title="Damped pendulum: the turns it makes before it settles",
+        title="Damped pendulum: full turns before it settles",
         xlabel="initial angle (radians)",
         ylabel="initial momentum",
     )
@@ -198,7 +198,9 @@ def simulate(options):
     y0 = starts(n)
     per_device = len(y0[0]) // mesh.size
     if len(y0[0]) % mesh.size:
-        raise SystemExit(f"{n * n} starting points do not split over {mesh.size}.")
+        raise SystemExit(
+            f"{n * n} initial states cannot be split over {mesh.size} devices."
+        )
     if me == 0:
         print(
             f"{n * n} trajectories over {mesh.size} x {jax.devices()[0].device_kind}"
@@ -216,21 +218,21 @@ def simulate(options):
     largest, bitwise = difference(ys, whole)
     verdict = "bitwise equal" if bitwise else f"equal to {largest:.1e}"
     print(
-        f"process {me}: {seconds:.2f} s; to the solve on one device: {verdict};"
+        f"process {me}: {seconds:.2f} s; compared with one device: {verdict};"
         f" communication in the compiled program: {described(program)}",
         flush=True,
     )
     if processes == 1 and mesh.size > 1:
         patterns(sharding, batch)
-    # Here, after the solve, the processes communicate for the first time.
+    # The first communication between processes, after the solve.
     q = multihost_utils.process_allgather(ys[0], tiled=True)
     if me == 0:
         picture(options.output, n, np.asarray(q))
-        print(f"Picture saved to {options.output}")
+        print(f"Figure saved to {options.output}")
 
 
 def launch(options):
-    """All processes on this machine, which are ended whatever happens."""
+    """Start all processes on this machine, and terminate them in any case."""
     with socket.socket() as probe:
         probe.bind(("localhost", 0))
         coordinator = f"localhost:{probe.getsockname()[1]}"
@@ -243,7 +245,7 @@ def launch(options):
             children.append(child)
         deadline = time.monotonic() + options.timeout
         codes: list[int | None] = [None]
-        # One that failed leaves the others waiting for it.
+        # If one process fails, the others would wait for it.
         while None in codes and not any(codes) and time.monotonic() < deadline:
             time.sleep(0.1)
             codes = [child.poll() for child in children]
@@ -256,16 +258,18 @@ def main():
     )
     parser.add_argument("--quick", action="store_true", help="a smaller run, for CI")
     parser.add_argument("--output", type=pathlib.Path, default="ensemble.png")
-    parser.add_argument("--devices", type=int, help="split the CPU into so many")
-    parser.add_argument("--processes", type=int, help="how many there are in all")
-    parser.add_argument("--process-id", type=int, help="which of them this one is")
+    parser.add_argument("--devices", type=int, help="number of devices of the CPU")
+    parser.add_argument("--processes", type=int, help="total number of processes")
+    parser.add_argument("--process-id", type=int, help="index of this process")
     parser.add_argument("--coordinator", help="host:port of process 0")
-    parser.add_argument("--cluster", action="store_true", help="ask the scheduler")
-    parser.add_argument("--timeout", type=float, default=600, help="seconds, at most")
+    parser.add_argument(
+        "--cluster", action="store_true", help="detect processes from the scheduler"
+    )
+    parser.add_argument("--timeout", type=float, default=600, help="in seconds")
     options = parser.parse_args()
     if options.processes and options.process_id is None:
         launch(options)
-    # All of this before anything is computed, as JAX then looks for its devices.
+    # Before any computation, when JAX initialises its devices.
     if options.devices:
         jax.config.update("jax_platforms", "cpu")
         jax.config.update("jax_num_cpu_devices", options.devices)

@@ -1,14 +1,14 @@
-"""Masses, friction and springs of a chain, from noisy measurements of its motion.
+"""Identify masses, friction and springs of a chain from noisy measurements.
 
-Three masses hang in a row from a wall, on springs that harden. They are released from
-rest at known places, and where they are is measured at a hundred times, with noise. All
-parameters are found by least squares: BFGS with gradients from `ReversibleAdjoint`, on
-a horizon that grows, since the whole of it at once has minima that are only local. The
-curvature at the least squares tells how sure the estimates are, and how far into the
-future they can be trusted. Measurements made anew, many times, tell whether that is so.
+Three masses are attached in a row to a wall, by hardening springs. They are released
+from rest at known positions, and their positions are measured at a hundred times, with
+noise. All parameters are estimated by least squares: BFGS with gradients from
+`ReversibleAdjoint`, on a growing time horizon, since a fit to all data at once ends in
+a local minimum. The curvature at the minimum gives the standard errors of the estimates
+and of the predictions, which are confirmed by repetitions with new noise.
 
-Positions cannot tell a chain from one of twice the masses on springs twice as strong.
-So the first mass is given.
+A chain with twice the masses and springs twice as stiff has the same positions. So the
+first mass is given.
 
     python examples/identify.py [--quick] [--output identify.png]
 """
@@ -40,12 +40,12 @@ TRUTH = {
     "hardening 2": 0.5,
     "hardening 3": 2.0,
 }
-# Fitted are logarithms, so that parameters stay positive.
+# Logarithms are fitted, so that the parameters stay positive.
 LOGS = np.log(list(TRUTH.values()))
 GUESS = np.log([1.0, 1.0, 0.1, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
-# Of the time of the data: how much is fitted, first and last.
+# Fractions of the time interval of the data that are fitted in turn.
 PARTS = (0.1, 0.3, 1.0)
-# Predicted is at all of these times, and measured at some.
+# Predictions are made at all of these times, and measurements at some.
 GRID = np.linspace(0, 3 * DURATION, 801)
 
 
@@ -56,7 +56,7 @@ def potential(t, q, args):
 
 
 def positions(logs, starts, ts, adjoint, step=STEP):
-    """Where the masses are, after every release."""
+    """The positions of the masses, for every release."""
     mass, friction, *springs = jnp.split(jnp.exp(logs), [2, 3, 6])
     hamiltonian = dps.ConformalHamiltonian(
         dps.QuadraticKinetic(jnp.concatenate([jnp.ones(1), mass])[None]),
@@ -69,7 +69,7 @@ def positions(logs, starts, ts, adjoint, step=STEP):
         t0=0.0,
         t1=ts[-1],
         dt0=step,
-        # One state for all: the releases share a friction, and so a frame.
+        # One state for all releases, as they have the same damping.
         y0=(starts, jnp.zeros_like(starts)),
         args=springs,
         saveat=dfx.SaveAt(ts=ts, fn=lambda t, y, args: y[0]),
@@ -82,7 +82,7 @@ def positions(logs, starts, ts, adjoint, step=STEP):
 
 @jax.jit
 def fit(logs, starts, ts, data, part):
-    """The least squares of the first part of the data, from a guess."""
+    """The least squares fit to the first part of the data, from an initial guess."""
     seen = (ts <= part * DURATION)[:, None, None]
 
     def misfit(logs, _):
@@ -102,19 +102,19 @@ def fit(logs, starts, ts, data, part):
 
 @jax.jit
 def predict(logs, starts, step):
-    """Positions on the whole grid, and their derivatives by the parameters."""
+    """Positions on the whole grid, and their derivatives in the parameters."""
 
     def twice(logs):
         q = positions(logs, starts, jnp.asarray(GRID), dfx.ForwardMode(), step)
         return q, q
 
-    # More outputs than inputs: forward mode.
+    # Forward mode, as there are more outputs than inputs.
     jacobian, q = jax.jacfwd(twice, has_aux=True)(logs)
     return q, jacobian
 
 
 def judge(logs, starts, seen, data):
-    """What a fit leaves, how sure it is, what it predicts, and how sure that is."""
+    """The residual of a fit, and its estimates and predictions with standard errors."""
     q, jacobian = map(np.asarray, predict(logs, starts, STEP))
     left = np.sqrt(np.sum((q[seen] - data) ** 2) / (data.size - logs.size))
     used = np.reshape(jacobian[seen], (-1, logs.size))
@@ -127,7 +127,7 @@ def picture(path, fits, truth, seen):
     fig, (left, right) = plt.subplots(
         1, 2, figsize=(12, 4.4), width_ratios=(2, 1), layout="constrained"
     )
-    # The last mass, after the first release.
+    # The last mass, for the first release.
     at = np.s_[:, 0, 2]
     noise, (data, _, _, _, q, spread) = next(iter(fits.items()))
     left.axvspan(0, DURATION, color="0.94", label="time of the data")
@@ -160,13 +160,14 @@ def main():
 
     rng = np.random.default_rng(0)
     starts = rng.uniform(-1, 1, size=(RELEASES, 3))
-    # Nature takes smaller steps.
+    # The data are computed with smaller steps.
     truth = np.asarray(predict(LOGS, starts, STEP / 5)[0])
     seen = np.sort(rng.choice(np.sum(GRID <= DURATION), MEASURED, replace=False))
     ts = GRID[seen]
     measure = lambda noise: truth[seen] + noise * rng.standard_normal(truth[seen].shape)
 
-    print("What fits leave, in units of the noise: to all at once, on growing horizons")
+    print("Residuals of the fits, in units of the noise: ", end="")
+    print("all data at once, growing horizons")
     fits = {}
     for noise in noises:
         data = measure(noise)
@@ -178,8 +179,8 @@ def main():
         left = judge(at_once, starts, seen, data)[0], fits[noise][2]
         print(f"{noise:<12}" + "".join(f"{x / noise:10.3f}" for x in left))
 
-    print("\nEstimates, their standard errors, and by how many of these they are off")
-    heads = "".join(f"{f'noise {x}':>12}{'error':>8}{'off by':>8}" for x in noises)
+    print("\nEstimates, their standard errors and z-scores")
+    heads = "".join(f"{f'noise {x}':>12}{'error':>8}{'z-score':>8}" for x in noises)
     print(f"{'':12}{'truth':>8}{heads}")
     for i, (name, true) in enumerate(TRUTH.items()):
         print(f"{name:12}{true:8.3f}", end="")
@@ -194,9 +195,10 @@ def main():
         logs = fit(fits[noise][1], starts, ts, data, PARTS[-1])
         off.append((logs - LOGS) / judge(logs, starts, seen, data)[1])
     off = np.abs(off)
-    print(f"\nMeasured anew {repeats} times, with noise {noise}: off by", end=" ")
-    print(f"{np.sqrt(np.mean(off**2)):.2f} standard errors in the mean square,")
-    print(f"{np.mean(off < 1):.0%} within one, {np.mean(off < 2):.0%} within two")
+    print(f"\n{repeats} repetitions with noise {noise}: root mean square ", end="")
+    print(f"z-score {np.sqrt(np.mean(off**2)):.2f},")
+    one, two = np.mean(off < 1), np.mean(off < 2)
+    print(f"{one:.0%} within one standard error, {two:.0%} within two")
     picture(options.output, fits, truth, seen)
     print(f"Saved {options.output}")
 

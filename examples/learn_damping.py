@@ -1,11 +1,10 @@
-"""Learn the friction of an optimiser, by the gradient through all of its steps.
+"""Learn the friction of an optimiser, by differentiating through all of its steps.
 
-A heavy ball rolls downhill on random quadratics, by two hundred steps of the leapfrog.
-How much friction brings it down furthest, and when? The rate of friction is made of
-constant pieces, and the mean logarithm of what is left of the objective is minimised
-over them, by BFGS with gradients from `ReversibleAdjoint`. The law that was learned is
-then compared, on problems that it has not seen, with the best constant friction and
-with Nesterov's, 3 / t.
+The optimiser is the heavy ball method on random quadratic functions, by two hundred
+steps of the leapfrog. The friction is piecewise constant in time. The mean logarithm of
+the final objective, relative to its initial value, is minimised by BFGS with gradients
+from `ReversibleAdjoint`. The learned law is then compared, on new problems, with the
+best constant friction and with Nesterov's, 3 / t.
 
     python examples/learn_damping.py [--quick] [--output learn_damping.png]
 """
@@ -26,7 +25,7 @@ import diffrax_presym as dps
 
 jax.config.update("jax_enable_x64", True)
 
-# The stiffest direction has frequency one; the leapfrog is stable up to steps of two.
+# The highest frequency is one; the leapfrog is stable up to steps of two.
 STEP, T0 = 1.0, 1.0
 
 
@@ -43,7 +42,7 @@ class Pieces(eqx.Module):
 
 
 def problems(seed, number, dimension=30):
-    """Curvatures spread evenly in their logarithms, and starts."""
+    """Log-uniform curvatures, and initial positions."""
     rng = np.random.default_rng(seed)
     least = 10.0 ** -rng.uniform(2, 4, size=(number, 1))
     curvatures = least ** rng.uniform(size=(number, dimension))
@@ -55,7 +54,7 @@ def potential(t, q, curvatures):
 
 
 def objectives(damping, batch, steps):
-    """Of every problem, over time: what is left of it, as a logarithm."""
+    """The logarithm of the relative objective, for every problem and time."""
     curvatures, q0 = batch
     hamiltonian = dps.ConformalHamiltonian(dps.QuadraticKinetic(), potential, damping)
     each = lambda q: jnp.log(jnp.sum(curvatures * q**2, axis=-1))
@@ -65,7 +64,7 @@ def objectives(damping, batch, steps):
         t0=T0,
         t1=T0 + steps * STEP,
         dt0=STEP,
-        # One state for all: the problems share a friction, and so a frame.
+        # One state for all problems, as they have the same damping.
         y0=(q0, jnp.zeros_like(q0)),
         args=curvatures,
         saveat=dfx.SaveAt(t0=True, steps=True, fn=lambda t, y, args: each(y[0])),
@@ -82,7 +81,7 @@ def mean(damping, batch, steps):
 
 
 def learn(knots, start, batch, steps, most):
-    """The best rates between the knots, from a constant rate."""
+    """Optimise the rates between the knots, from a constant rate."""
     solution = optx.minimise(
         lambda logs, _: mean(Pieces(knots, logs), batch, steps),
         optx.BFGS(rtol=1e-4, atol=1e-4),
@@ -113,8 +112,8 @@ def main():
         "Nesterov, 3 / t": dps.LogDamping(3.0),
         "learned": learned,
     }
-    print(f"Objective after {steps} steps, of what it was; mean over {number} problems")
-    print(f"{'friction':20}{'seen':>12}{'unseen':>12}")
+    print(f"Relative objective after {steps} steps, mean over {number} problems")
+    print(f"{'friction':20}{'training':>12}{'test':>12}")
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     ts = T0 + STEP * np.arange(steps + 1)
     for name, law in laws.items():
@@ -122,10 +121,10 @@ def main():
         print(f"{name:20}" + "".join(f"{x:>12.1e}" for x in left_over))
         curve = np.mean(objectives(law, unseen, steps), axis=1)
         left.semilogy(ts, np.exp(curve), label=name)
-        # Between the steps, where every law has a rate.
+        # Between the steps, where every law is differentiable.
         middle = jnp.asarray(ts[:-1] + ts[1:]) / 2
         right.plot(middle, jax.vmap(jax.grad(law.__call__))(middle))
-    left.set(xlabel="time", ylabel="objective, of what it was", title="Unseen problems")
+    left.set(xlabel="time", ylabel="relative objective", title="Test problems")
     right.set(xlabel="time", ylabel="rate of friction", yscale="log", title="Friction")
     left.legend()
     for ax in (left, right):

@@ -1,11 +1,11 @@
-"""Learn potential and friction of a system, and follow it far beyond the data.
+"""Learn the potential and the friction of a system, and extrapolate in time.
 
-Two coupled pendulums with friction are seen for a short time, with noise. A network
-for the potential and a number for the friction are trained through the solver, with
-gradients from `ReversibleAdjoint`. Beside it stands a plain neural ODE: a network of as
-many parameters for the whole vector field, solved by Tsit5. Both are then followed from
-starts that they have not seen, for twenty times as long as they were trained. Nothing
-but the structure of the first says that its energy decays, whatever it has learned.
+The data are short, noisy trajectories of two coupled pendulums with friction. A neural
+network for the potential and a friction coefficient are trained through the solver,
+with gradients from `ReversibleAdjoint`. For comparison, a plain neural ODE, with about
+as many parameters, learns the whole vector field, solved by Tsit5. Both are then
+integrated from new initial states, for twenty times the training time. The energy of
+the structured model decays by construction.
 
     python examples/learn_energy.py [--quick] [--output learn_energy.png]
 """
@@ -29,13 +29,13 @@ TRAINED, FOLLOWED, STEP = 4.0, 80.0, 0.1
 
 
 def pendulums(t, q, args):
-    """Of a batch of starts, of shape (start, pendulum): the sum of all potentials."""
+    """The sum of the potentials of a batch, of shape (trajectory, pendulum)."""
     apart = q[:, 0] - q[:, 1]
     return jnp.sum(1 - jnp.cos(q)) + jnp.sum(apart**2) / 4
 
 
 class Structured(eqx.Module):
-    """A potential and a friction, both learned."""
+    """A learned potential and a learned friction coefficient."""
 
     potential: eqx.nn.MLP
     log_friction: jax.Array
@@ -50,7 +50,7 @@ class Structured(eqx.Module):
 
 
 class Plain(eqx.Module):
-    """A vector field, learned as a whole."""
+    """A learned vector field."""
 
     field: eqx.nn.MLP
 
@@ -83,7 +83,7 @@ def solve(term, solver, adjoint, y0, ts):
         y0=y0,
         saveat=dfx.SaveAt(ts=ts),
         adjoint=adjoint,
-        # Twice as many as there are, since rounding may add one.
+        # With a margin, since rounding may add a step.
         max_steps=2 * round(FOLLOWED / STEP),
     )
     assert sol.ys is not None
@@ -119,7 +119,7 @@ def train(model, y0, ts, data, steps):
 
 
 def energy(ys):
-    """True energies, of shape (time, start)."""
+    """Exact energies, of shape (time, trajectory)."""
     q, p = ys
     each = jax.vmap(lambda q, p: jnp.sum(p**2) / 2 + pendulums(0.0, q[None], None))
     return np.asarray(jax.vmap(each)(q, p))
@@ -155,9 +155,9 @@ def main():
     curves = {"exact": exact} | {name: model(y0, ts) for name, model in models.items()}
     short = int(np.sum(np.asarray(ts) <= TRAINED))
     friction = float(jnp.exp(models["structured"].log_friction))
-    print(f"\nfriction {friction:.4f}, exact {FRICTION}; 100 unseen starts:")
-    # Of all rises of the energy between two times, the sum; and what is left of it.
-    columns = ("error to t = 4", "error to t = 80", "energy rises", "energy at 80")
+    print(f"\nfriction {friction:.4f}, exact {FRICTION}; 100 new initial states:")
+    # The sum of all increases of the energy between two times, and the final energy.
+    columns = ("error to t = 4", "error to t = 80", "energy increase", "energy at 80")
     print(f"{'':12}" + "".join(f"{x:>18}" for x in columns))
     for name, ys in curves.items():
         rises = np.maximum(np.diff(energy(ys), axis=0), 0).sum(axis=0)

@@ -1,14 +1,14 @@
-"""Three systems whose energy is no sum of kinetic and potential energy, with friction.
+"""Three nonseparable systems with friction.
 
-- A charged particle with drag, in a trap and a magnetic field that dies away as fast as
-  the drag slows the particle: that much of drag on a charge is Hamiltonian. Checked
-  against Newton's second law.
+- A charged particle with drag, in a trap and a magnetic field that decays at the rate
+  of the drag; for this field the system is Hamiltonian. Checked against Newton's second
+  law.
 - A double pendulum with friction.
-- A relativistic particle around a black hole, in its Schwarzschild metric, losing
-  momentum slowly.
+- A relativistic particle around a black hole, in the Schwarzschild metric, with slow
+  loss of momentum.
 
-Prints a table of errors against evaluations, and saves one picture. `--quick` runs a
-smaller version of all of it.
+Prints a table of errors and numbers of evaluations, and saves one figure. `--quick`
+runs a smaller version.
 """
 
 import argparse
@@ -36,7 +36,7 @@ FIELD, DRAG = 4.0, 0.05
 
 
 def vector_potential(t, q):
-    """Of a uniform field across the plane."""
+    """The vector potential of a uniform field perpendicular to the plane."""
     return jnp.exp(-DRAG * t) * FIELD / 2 * jnp.array([-q[1], q[0]])
 
 
@@ -49,14 +49,14 @@ def charged(t, q, p, args):
 
 
 def newton(t, y, args):
-    """Drag, the force of the field on a moving charge, and that of the trap."""
+    """The vector field with drag, Lorentz force and trap."""
     q, v = y
     magnetic = jnp.exp(-DRAG * t) * FIELD * jnp.array([v[1], -v[0]])
     return v, magnetic - DRAG * v - jax.grad(trap)(q)
 
 
 def double_pendulum(t, q, p, args):
-    """Of unit lengths, masses and gravity."""
+    """A double pendulum with unit lengths, masses and gravity."""
     a, b = q
     cos = jnp.cos(a - b)
     kinetic = p[0] ** 2 + 2 * p[1] ** 2 - 2 * p[0] * p[1] * cos
@@ -64,7 +64,7 @@ def double_pendulum(t, q, p, args):
 
 
 def black_hole(t, q, p, args):
-    """Equation of motion of a unit mass, in units of the mass of the hole."""
+    """The energy of a unit mass, in units of the mass of the black hole."""
     r = jnp.sqrt(q @ q)
     lapse = 1 - 2 / r
     radial = q @ p / r
@@ -75,8 +75,8 @@ def system(energy, gamma):
     return dps.ConformalHamiltonian(energy=energy, damping=dps.ConstantDamping(gamma))
 
 
-# Hamiltonian, initial state, time, the longest of the steps of order 4, and the ratio
-# of the sizes of q and p
+# Hamiltonian, initial state, final time, the longest step of order 4, and the ratio of
+# the magnitudes of q and p
 SYSTEMS = {
     "charged particle": (
         system(charged, DRAG),
@@ -95,8 +95,8 @@ SYSTEMS = {
     ),
 }
 FINDER = optx.Newton(rtol=1e-12, atol=1e-12)
-# And the evaluations of velocity and force in a step, of which an implicit one has none
-# that can be counted beforehand.
+# Schemes, and evaluations of velocity and force per step, which are not known in
+# advance for the implicit scheme.
 SCHEMES = {
     "Coupled, 4": (lambda scale: dps.PresymplecticCoupled(4, scale=scale), 11),
     "Projected, 4": (lambda _: dps.PresymplecticProjected(4), 11),
@@ -121,7 +121,7 @@ def solve(hamiltonian, solver, y0, t1, steps, saveat, max_steps=None) -> Any:
 
 
 def table(quick):
-    print("Error at the final time, and the evaluations it took\n")
+    print("Error at the final time, and number of evaluations\n")
     print(f"{'':20}" + "".join(f"{name:>26}" for name in SYSTEMS))
     exact = {}
     for name, (H, y0, (t1, h, _)) in SYSTEMS.items():
@@ -142,7 +142,7 @@ def table(quick):
             continue
         row = f"{scheme:20}"
         for name, (H, y0, (t1, h, scale)) in SYSTEMS.items():
-            # Steps of equal cost; those of the implicit scheme are as long as Tao's.
+            # Steps of equal cost; the implicit scheme takes as many steps as Tao's.
             steps = round(t1 / h * (1 if quick else 4) * 11 / (cost or 3))
             sol = solve(H, make(scale), y0, t1, steps, dfx.SaveAt(t1=True))
             end = np.concatenate([np.asarray(y[-1]) for y in sol.ys])
@@ -153,7 +153,7 @@ def table(quick):
 
 
 def against_newton():
-    """The largest difference of the positions to those by Newton's second law."""
+    """The largest difference of the positions to a solution of Newton's equation."""
     H, (q0, p0), (t1, _, _) = SYSTEMS["charged particle"]
     v0 = p0 - vector_potential(0.0, q0)
     ts = jnp.linspace(0.0, t1, 201)
@@ -200,7 +200,7 @@ def picture(path):
         ax.set(xlabel="x", ylabel="y")
         ax.set_aspect("equal", adjustable="datalim")
         ax.grid(alpha=0.3)
-    fig.suptitle("Three nonseparable systems, from dark to bright as time goes on")
+    fig.suptitle("Three nonseparable systems; time increases from dark to bright")
     fig.savefig(path, dpi=90)
 
 
@@ -212,7 +212,7 @@ def main():
     table(options.quick)
     against_newton()
     picture(options.output)
-    print(f"\nPicture saved to {options.output}")
+    print(f"\nFigure saved to {options.output}")
 
 
 if __name__ == "__main__":

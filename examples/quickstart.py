@@ -1,7 +1,7 @@
 """Every scheme of the paper on four dissipative systems, in one minute.
 
 Prints two tables, error against step size and speed against error, and saves one
-picture. `--quick` runs a smaller version of all of it.
+figure. `--quick` runs a smaller version.
 """
 
 import argparse
@@ -152,7 +152,7 @@ def convergence(hs):
         ),
         "damped pendulum": (solution_error(PENDULUM, 2.0, 10.0), 1e-11),
     }
-    print("Order, measured; and the error at step size h =", hs[2])
+    print("Measured order, and error at step size h =", hs[2])
     print(f"{'':26} {'order':>5}" + "".join(f" {name:>26}" for name in problems))
     errors = {}
     for scheme, solver in SCHEMES.items():
@@ -165,7 +165,7 @@ def convergence(hs):
 
 
 def canonical_terms(gamma):
-    """The pendulum for Diffrax's `SemiImplicitEuler`, in canonical momentum."""
+    """The pendulum for Diffrax's `SemiImplicitEuler`, with canonical momentum."""
     velocity = lambda t, P, args: jnp.exp(-gamma * t) * P
     force = lambda t, q, args: -jnp.exp(gamma * t) * jnp.sin(q)
     return dfx.ODETerm(velocity), dfx.ODETerm(force)
@@ -217,7 +217,7 @@ def speed(quick):
     exact = constant(term, dfx.Dopri8())(0.005)
     repeats = 3 if quick else 15
     curves = {name: [] for name in runs}
-    # All by turns, so that a slow moment of the machine strikes everyone.
+    # The runs alternate, so that changes of the load of the machine affect all alike.
     times = {(name, x): [] for name, (_, xs) in runs.items() for x in xs}
     for solve, xs in runs.values():
         for x in xs:
@@ -236,9 +236,7 @@ def speed(quick):
             curves[name].append(
                 (distance((q, p), exact), statistics.median(times[name, x]) * 1e6)
             )
-    print(
-        f"\nDamped pendulum to t = 100: microseconds, median of {repeats}, to an error"
-    )
+    print(f"\nDamped pendulum to t = 100: time (median of {repeats} runs) and error")
     for name, curve in curves.items():
         pairs = "".join(f" {us:>7.0f} us to {e:.0e}" for e, us in curve)
         print(f"{name:26}{pairs}")
@@ -246,10 +244,10 @@ def speed(quick):
 
 
 def basins(n):
-    """Which well a damped ball ends in, for a grid of starting points."""
+    """The well in which a damped particle settles, for a grid of initial states."""
     term = dps.HamiltonianTerm(DOUBLE_WELL)
     q0, p0 = jnp.meshgrid(jnp.linspace(-2.5, 2.5, n), jnp.linspace(-2.5, 2.5, n))
-    print("\nDouble well, one solve of", n * n, "starting points:")
+    print("\nDouble well, one solve for", n * n, "initial states:")
     sol = dfx.diffeqsolve(
         term,
         dps.PresymplecticLeapfrog(),
@@ -297,7 +295,7 @@ def picture(path, hs, errors, curves, wells):
         wells, origin="lower", extent=(-2.5, 2.5, -2.5, 2.5), cmap="RdBu", aspect="auto"
     )
     axes[1, 1].set(
-        title="Damped double well: the well a start ends in",
+        title="Damped double well: final well by initial state",
         xlabel="initial position",
         ylabel="initial momentum",
     )
@@ -314,7 +312,7 @@ def main():
     curves = speed(options.quick)
     wells = basins(40 if options.quick else 400)
     picture(options.output, hs, errors, curves, wells)
-    print(f"\nPicture saved to {options.output}")
+    print(f"\nFigure saved to {options.output}")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Minimisation over the probability simplex, in its own geometry: no projection.
+"""Minimisation over the probability simplex without projections.
 
 The weights of a mixture are fitted to data by maximum likelihood. Bregman dynamics with
-the entropic mirror map stays inside of the simplex, to rounding; without a mirror map
-it leaves. Prints a table and saves one picture. `--quick` runs a smaller version.
+the entropic mirror map stays in the simplex, to rounding; without a mirror map it does
+not. Prints a table and saves one figure. `--quick` runs a smaller version.
 """
 
 import argparse
@@ -27,10 +27,10 @@ ENTROPIC = dps.EntropyMirror(simplex=True)
 
 
 def mixture(components, samples):
-    """The likelihoods of samples of a mixture, under each of its components."""
+    """The likelihoods of samples of a mixture under each of its components."""
     random = np.random.default_rng(1)
     centers = np.linspace(-2, 2, components)
-    # Half of the components have no samples: the best weights are on the boundary.
+    # Half of the components have no samples, so the optimum is on the boundary.
     weights = random.dirichlet(np.ones(components)) * (np.arange(components) % 2 == 0)
     chosen = random.choice(components, samples, p=weights / weights.sum())
     x = centers[chosen] + 0.7 * random.normal(size=samples)
@@ -113,7 +113,7 @@ def main():
     components, steps = (20, 300) if options.quick else (50, 3000)
     likelihoods = mixture(components, 500)
     uniform = jnp.full(components, 1 / components)
-    # The least surprise, by carrying on for long.
+    # The minimum, from a long run.
     final = descend(ENTROPIC, likelihoods, uniform, 0.5, 20 * steps)[-1]
     least = surprise(0.0, jnp.array(final), likelihoods)
     value = jax.jit(jax.vmap(lambda q: surprise(0.0, q, likelihoods)))
@@ -128,7 +128,7 @@ def main():
     descent = [mirror_descent(likelihoods, 1.0, k) for k in counts]
     descent_gap = np.asarray(value(jnp.stack(descent)) - least)
     print(f"Weights of {components} components, {steps} gradients: f - f* at the end,")
-    print("the least weight and the largest |sum - 1| on the way\n")
+    print("and the smallest weight and the largest |sum - 1| along the solution\n")
     for name, q in runs.items():
         off = np.max(np.abs(q.sum(1) - 1))
         gap = f"{gaps[name][-1]:.1e}" if off < 1e-6 else "left"
@@ -142,7 +142,7 @@ def main():
     gaps = {"Bregman dynamics, entropic, Strang": gaps["entropic mirror, Strang"]}
     gaps["mirror descent"] = np.interp(np.arange(1, steps + 1), counts, descent_gap)
     picture(options.output, gaps, triangle, paths)
-    print(f"\nPicture saved to {options.output}")
+    print(f"\nFigure saved to {options.output}")
 
 
 if __name__ == "__main__":

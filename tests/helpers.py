@@ -1,4 +1,4 @@
-"""What the tests share: the list of schemes, a few systems, and ways to run them."""
+"""Shared by the tests: the list of schemes, some systems, and functions to run them."""
 
 import dataclasses
 import json
@@ -18,7 +18,7 @@ import diffrax_presym as dps
 from diffrax_presym._system import System
 
 
-# What a scheme must know of the energy, and so which systems it can be tested on.
+# The form of the energy that a scheme requires, i.e. the systems it is tested on.
 Kind = Literal[
     "frozen",  # T(t, p) + V(t, q), explicit; or anything, with a root finder
     "split",  # a kinetic energy whose exact flow is known, and V(t, q)
@@ -30,7 +30,7 @@ Kind = Literal[
 
 @dataclasses.dataclass(frozen=True)
 class Scheme:
-    """A solver and what is claimed of it."""
+    """A solver and its claimed properties."""
 
     name: str
     solver: Any
@@ -43,7 +43,7 @@ class Scheme:
         return self.name
 
 
-# A new scheme is one new line here.
+# A new scheme is added as one line.
 SCHEMES = [
     Scheme("euler_A", dps.PresymplecticEuler("momentum"), 1, 1, symmetric=False),
     Scheme("euler_B", dps.PresymplecticEuler("position"), 1, 1, symmetric=False),
@@ -66,7 +66,7 @@ SCHEMES = [
     ),
     Scheme("coupled_4", dps.PresymplecticCoupled(4), 4, 11, kind="coupled"),
 ]
-# One for each way through the code, from which the others differ by numbers alone.
+# One scheme for each code path; the others differ only in their coefficients.
 WAYS = [
     scheme
     for scheme in SCHEMES
@@ -82,17 +82,17 @@ WAYS = [
         "coupled_4",
     }
 ]
-# One for each kind of what is carried from step to step, all that Diffrax sees of a
-# scheme: nothing, a force, copies, their difference.
+# One scheme for each kind of solver state: none, a force, a copy, the difference of two
+# copies. Diffrax does not depend on anything else.
 CARRIES = [
     scheme
     for scheme in SCHEMES
     if scheme.name in {"leapfrog_BA", "suzuki_yoshida_4", "tao_4", "coupled_4"}
 ]
-# Those that are explicit for any energy.
+# Schemes that are explicit for any energy.
 ANY: tuple[Kind, ...] = ("augmented", "coupled")
 
-# Schemes for any energy: those with frozen velocities, made implicit.
+# Implicit schemes for any energy, with the velocity evaluated at one end.
 _finder = optx.Newton(rtol=1e-12, atol=1e-12)
 IMPLICIT = [
     Scheme(
@@ -109,7 +109,7 @@ IMPLICIT = [
 
 
 def each(schemes=SCHEMES, *, kinds: tuple[Kind, ...] | None = None, symmetric=None):
-    """Parametrise a test over schemes; by default over all there are."""
+    """Parametrise a test over schemes; by default over all of them."""
     chosen = [
         scheme
         for scheme in schemes
@@ -120,7 +120,7 @@ def each(schemes=SCHEMES, *, kinds: tuple[Kind, ...] | None = None, symmetric=No
 
 
 def few(cases, schemes):
-    """All cases for each kind of what is carried, for other schemes the first."""
+    """All cases for each kind of solver state; the first case for other schemes."""
     first, *_ = cases
     chosen = [(s, c) for s in schemes for c in cases if s in CARRIES or c == first]
     return pytest.mark.parametrize("scheme, case", chosen, ids=repr)
@@ -131,7 +131,7 @@ def reference(name: str):
     return json.loads(path.read_text())[name]
 
 
-# Functions are defined once: a fresh closure would be traced and compiled again.
+# Functions are defined once, as a new closure would be compiled again.
 
 
 def harmonic(t, q, args):
@@ -147,7 +147,7 @@ def henon_heiles(t, q, args):
 
 
 def mixed_energy(t, q, p, args):
-    """Not a sum of kinetic and potential energy."""
+    """A nonseparable energy."""
     return (1 + jnp.sum(q**2)) * (1 + jnp.sum(p**2)) / 2
 
 
@@ -162,11 +162,11 @@ def drift(hamiltonian, t, h, q, p):
     return System(hamiltonian, None, 1).drift(t, h, (q, p), order=8)
 
 
-# A Python number would be a constant of the compiled code: compile once for all times.
+# Python numbers would be compiled as constants: compile once for all times.
 
 
 def step(hamiltonian, solver, t0, t1, y, args=None):
-    """One step, afresh, and everything it returns, as `diffeqsolve` would call it."""
+    """One step from a new solver state, as in `diffeqsolve`, with all its outputs."""
     t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
     return _step(hamiltonian, solver, t0, t1, y, args)
 
@@ -179,7 +179,7 @@ def _step(hamiltonian, solver, t0, t1, y, args):
 
 
 def solve(hamiltonian, solver, t0, t1, dt0, y0, args=None, **kwargs):
-    """A solve, at most 4096 steps long, of which the end is saved."""
+    """A solve of at most 4096 steps that saves the final state."""
     term = dps.HamiltonianTerm(hamiltonian)
     t0, t1, dt0 = jnp.asarray(t0), jnp.asarray(t1), jnp.asarray(dt0)
     return _solve(term, solver, t0, t1, dt0, y0, args, **kwargs)
@@ -189,7 +189,7 @@ _solve = eqx.filter_jit(dfx.diffeqsolve)
 
 
 def trajectory(hamiltonian, solver, t0, t1, dt0, y0, args=None, **kwargs):
-    """Times, positions and momenta of every step, the start included."""
+    """Times, positions and momenta of every step, including the initial ones."""
     saveat = dfx.SaveAt(t0=True, steps=True)
     sol = solve(hamiltonian, solver, t0, t1, dt0, y0, args, saveat=saveat, **kwargs)
     assert sol.ts is not None and sol.ys is not None

@@ -1,8 +1,8 @@
-"""The schemes as the paper prints them: plain NumPy, canonical momentum `P`.
+"""The schemes as printed in the paper: plain NumPy, canonical momentum `P`.
 
 `H.velocity(t, q, P)` and `H.slope(t, q, P)` are the derivatives of `H(t, q, P)` with
-respect to `P` and `q`. Implicit equations are solved by iteration, which for a
-separable system is exact after one.
+respect to `P` and `q`. Implicit equations are solved by fixed-point iteration, which
+for a separable system is exact after one iteration.
 """
 
 from collections.abc import Callable
@@ -50,7 +50,7 @@ def leapfrog_BA(H, t, h, q, P):
 
 
 def triple_jump(base, order):
-    """Equation (yoshida_comp), from a base of the order below."""
+    """Equation (yoshida_comp), from a base scheme of lower order."""
 
     def scheme(H, t, h, *y):
         kappa = 2 ** (1 / (order - 1))
@@ -74,8 +74,8 @@ def repeat(base, n):
 def tao(coupling):
     """Equations (tao_map1) to (tao_flow), for `(q, P)` and its copy.
 
-    The coupling acts on `exp(-eta) P`, which the paper's does not: unscaled, the
-    copies part once `exp(eta)` is large.
+    The coupling acts on `exp(-eta) P`, unlike that of the paper: without this scaling,
+    the copies separate once `exp(eta)` is large.
     """
 
     def A(H, t, t_copy, h, q, P, q_copy, P_copy):
@@ -108,7 +108,7 @@ def tao(coupling):
 
 fixed_tao = tao(lambda h: 5.0)
 
-# By the names in `helpers.SCHEMES`.
+# By the names of `helpers.SCHEMES`.
 SCHEMES: dict[str, Callable[..., tuple]] = {
     "euler_A": euler_A,
     "euler_B": euler_B,

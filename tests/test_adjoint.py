@@ -1,4 +1,4 @@
-"""Gradients by running the scheme backwards, against all other ways to get them."""
+"""Gradients by running the scheme backwards, against other methods."""
 
 import functools
 from functools import partial
@@ -45,7 +45,7 @@ def nonseparable(gamma):
 
 
 def add_up(tree):
-    """One number that every entry saved has a part of; what was not saved is left."""
+    """A scalar that depends on every saved entry; unused entries are ignored."""
 
     def leaf(x):
         weights = jnp.cos(jnp.arange(x.size, dtype=x.dtype)).reshape(x.shape)
@@ -69,7 +69,7 @@ def solve(inputs, adjoint, solver: Any = LEAPFROG, system=separable, **kwargs):
 
 def value(inputs, adjoint, kwargs):
     sol = solve(inputs, adjoint, **kwargs)
-    # Of what is not asked for, a solution has `None`.
+    # Outputs that are not saved are `None`.
     dense = None if sol.interpolation is None else sol.evaluate(0.37 * sol.t1)
     return add_up((sol.ys, sol.solver_state, dense))
 
@@ -79,7 +79,7 @@ value_and_gradient = eqx.filter_jit(eqx.filter_value_and_grad(value))
 
 @eqx.filter_jit
 def by_forward_mode(inputs, kwargs):
-    """The same by another way, which compiles in half the time of reverse mode."""
+    """The same in forward mode, which compiles in half the time of reverse mode."""
     numbers, unravel = ravel_pytree(inputs)
 
     def of_numbers(numbers):
@@ -100,7 +100,7 @@ def named(schemes, *names):
     return [scheme for scheme in schemes if scheme.name in names]
 
 
-# Compiling a gradient takes seconds, so one scheme stands for all that work alike.
+# Compiling a gradient takes seconds, so one scheme of each kind is tested.
 
 
 @each(named(SCHEMES, "euler_A", "leapfrog_BA", "suzuki_yoshida_4", "tao"))
@@ -153,7 +153,7 @@ TS = jnp.array([0.0, 0.05, 0.05, 0.3, 0.71, 1.0])
     ids=lambda saveat: "-".join(saveat),
 )
 def test_cotangents_of_all_that_is_saved(saveat):
-    # Backwards in time, and `dt0` does not divide the span: the last steps are shorter.
+    # Backwards in time, and with shorter last steps, as `dt0` does not divide the span.
     sign = -1
 
     def turn(x):
@@ -227,7 +227,7 @@ class Bowl(eqx.Module):
 
 
 def test_gradients_of_what_functions_of_the_term_close_over():
-    """However deep: in functions of functions, of defaults, of modules, of `args`."""
+    """At any depth: in closures of closures, of defaults, of modules, of `args`."""
 
     def gradient(adjoint):
         def loss(x):
@@ -261,7 +261,7 @@ def test_gradients_of_what_functions_of_the_term_close_over():
 
 
 def test_saved_values_by_central_differences():
-    """Of one number of each kind that can be saved, along one direction."""
+    """For one number of each kind of output, along one direction."""
     saveat = dfx.SaveAt(subs=[dfx.SubSaveAt(ts=TS, steps=2), dfx.SubSaveAt(t1=True)])
     saveat = eqx.tree_at(lambda x: x.subs[1].fn, saveat, energy)
 
@@ -283,7 +283,7 @@ def test_saved_values_by_central_differences():
 @pytest.mark.slow
 @pytest.mark.parametrize("made_jump", [None, True])
 def test_a_solve_continued_from_another(made_jump):
-    """What a solver carries comes from the first half; or is made anew after a jump."""
+    """The solver state is that of the first half, or recomputed after a jump."""
 
     def gradient(adjoint):
         def loss(y0):
@@ -318,7 +318,7 @@ def test_a_stale_solver_state_is_an_error():
 
 @pytest.mark.slow
 def test_an_optimiser_of_optax():
-    """Friction and stiffness are found again, by a training loop as users write it."""
+    """Friction and stiffness are recovered by a typical training loop."""
 
     class Model(eqx.Module):
         gamma: jax.Array
@@ -337,7 +337,7 @@ def test_an_optimiser_of_optax():
         return sum(jtu.tree_leaves(errors))
 
     @eqx.filter_jit
-    @jax.numpy_dtype_promotion("standard")  # Optax needs it.
+    @jax.numpy_dtype_promotion("standard")  # Required by Optax.
     def update(model, state):
         value, gradient = loss(model)
         change, state = optimiser.update(gradient, state)
@@ -372,7 +372,7 @@ def damping_gradient(adjoint, inputs):
                 dps.QuadraticKinetic(), undriven, dps.ConstantDamping(gamma)
             )
         )
-        # Every step counts: what is left at the end has forgotten the start.
+        # Early states are saved, as the final state does not depend on the initial one.
         saveat = dfx.SaveAt(ts=jnp.linspace(0.0, 4.0, 20, dtype=dtype))
         t0, t1, dt0 = (jnp.asarray(t, dtype) for t in (0.0, 100.0, 1 / 16))
         y0 = q0, jnp.zeros_like(q0)
@@ -384,7 +384,7 @@ def damping_gradient(adjoint, inputs):
 
 
 def strongly_damped(adjoint, eta, dtype: Any = jnp.float64):
-    """The gradient of a solve that damps by `eta` e-folds, a trap for reversal."""
+    """The gradient of a solve with `eta` e-folds of damping, hard to reverse."""
     inputs = jnp.array([1.0, 0.3], dtype), jnp.asarray(eta / 100, dtype)
     return damping_gradient(adjoint, inputs)
 

@@ -30,7 +30,7 @@ def entropy(q):
 
 @dataclasses.dataclass(frozen=True)
 class Mirror:
-    """A mirror map, and its convex dual by hand."""
+    """A mirror map, and its convex conjugate in closed form."""
 
     name: str
     map: Any
@@ -84,7 +84,7 @@ def rising(t):
     return 0.5 * t**2
 
 
-# exp(alpha) = t, and beta slower than it may be
+# exp(alpha) = t, and beta slower than the ideal scaling
 OWN_SCALING = dps.Scaling(jnp.log, lambda t: 0.4 * t**2, rising, t0=0.5, t1=4.0)
 SCALINGS = {
     "polynomial": dps.PolynomialScaling(3.0, 0.4),
@@ -106,7 +106,7 @@ def system(mirror, scaling="polynomial", f=objective):
     return dps.BregmanHamiltonian(mirror.map, f, SCALINGS[scaling])
 
 
-# Motion
+# Equations of motion
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def test_equations_of_motion_are_those_of_the_hamiltonian(mirror, scaling):
 
     @jax.jit
     def hamiltonian(t, q, momentum):
-        """Equation (bregman_ham), of the canonical momentum and by the dual."""
+        """Equation (bregman_ham), with canonical momentum and convex conjugate."""
         alpha, beta, gamma = law.alpha(t), law.beta(t), law.gamma(t)
         image = mirror.map.gradient(q)
         there = image + jnp.exp(-gamma) * momentum
@@ -138,7 +138,7 @@ def test_equations_of_motion_are_those_of_the_hamiltonian(mirror, scaling):
     dq, dp = eqx.filter_jit(dps.HamiltonianTerm(H).vf)(T0, (Q, P), None)
     assert_close(dq, velocity, 1e-13)
     change = H.from_canonical(T0, -slope) - law.gamma.rate(T0) * P
-    # Momenta on the simplex are defined but for a constant.
+    # Momenta on the simplex are defined up to a constant.
     assert_close(dp, mirror.map.project(change), 1e-13)
 
 
@@ -164,7 +164,7 @@ def test_drift_is_the_flow_without_the_objective(mirror):
     H = system(mirror, "exponential", nothing)
     flow = eqx.filter_jit(drift)
     end = flow(H, T0, jnp.array(1.0), Q, P)
-    # Two drifts are one.
+    # The composition of two drifts is one drift.
     middle = flow(H, T0, jnp.array(0.3), Q, P)
     assert_close(flow(H, T0 + 0.3, jnp.array(0.7), *middle), end, 2e-12)
 
@@ -173,7 +173,7 @@ def test_drift_is_the_flow_without_the_objective(mirror):
         fn = lambda s: drift(H, T0, s, Q, P)
         return jax.jvp(fn, (s,), (jnp.ones_like(s),))
 
-    # Its rate of change is the vector field, and so it is the flow.
+    # Its derivative is the vector field, so it is the flow.
     y, dy = rate(jnp.array(0.6))
     assert_close(
         dy, eqx.filter_jit(dps.HamiltonianTerm(H).vf)(T0 + 0.6, y, None), 1e-12
@@ -182,7 +182,7 @@ def test_drift_is_the_flow_without_the_objective(mirror):
 
 @over("euclidean", "entropy", "simplex", "log barrier")
 def test_drift_keeps_its_digits_in_float32(mirror):
-    # A step of 1e-3 at t = 1000 moves by a few millionths.
+    # A step of 1e-3 at t = 1000 changes the state by a few millionths.
     H = system(mirror)
     single = [jnp.float32(x) for x in (1e3, 1e-3, Q, P)]
     double = [x.astype(jnp.float64) for x in single]
@@ -207,7 +207,7 @@ EXPLICIT = {
 
 @functools.cache
 def exact_end(mirror):
-    # By a method that knows nothing of the drift.
+    # By a method that does not use the drift.
     H = system(NAMED[mirror])
     return flat(solve(H, dfx.Dopri8(), 1.0, 2.0, 1 / 64, (Q, P)).ys)
 
@@ -227,7 +227,7 @@ def test_order_of_splittings(mirror, scheme):
     assert abs(measured - order) < 0.3
 
 
-# The tangents of the simplex: what sums to zero.
+# The tangent space of the simplex: vectors that sum to zero.
 TANGENT = np.array([[1, -1, 0], [1, 1, -2]]).T / np.sqrt([2, 6])
 
 
@@ -276,7 +276,7 @@ def test_quadratic_case_is_the_separable_one():
         _, q, p = trajectory(bregman, solver, T0, T0 + 2, 0.1, (Q, P))
         t, q2, p2 = trajectory(separable, solver, T0, T0 + 2, 0.1, (Q, start))
         assert_close(q, q2, 1e-13)
-        # In the frames of gamma and of eta2.
+        # With the log scales gamma and eta2.
         momenta = jax.vmap(bregman.to_canonical)(t, p)
         assert_close(momenta, jax.vmap(separable.to_canonical)(t, p2), 1e-13)
 
@@ -301,7 +301,7 @@ def test_positions_stay_on_the_simplex(dtype):
     assert np.all(q[-1, :, 0] > 0.99)
 
 
-# Rates. With f(q) = exp(-q) the motion is known: q = beta(t), p = 1, so f = exp(-beta).
+# Rates. For f(q) = exp(-q) the exact solution is q = beta(t), p = 1, so f = exp(-beta).
 
 
 def falling(t, q, args):
@@ -321,7 +321,7 @@ def test_objective_falls_like_exp_of_beta(rate):
     scaling = RATES[rate]
     H = dps.BregmanHamiltonian(dps.EuclideanMirror(), falling, scaling)
     if rate == "own":
-        # It falls short of the optimal rate.
+        # Slower than the optimal rate.
         H = eqx.tree_at(
             lambda H: H.scaling,
             H,
@@ -336,7 +336,7 @@ def test_objective_falls_like_exp_of_beta(rate):
     assert_close(np.log(gap), -beta(jnp.array(t)), 1e-6)
 
 
-# What is refused, and what fails
+# Errors and failures
 
 
 @pytest.mark.parametrize(
@@ -356,7 +356,7 @@ def test_violated_scaling_conditions_are_an_error_with_the_time(
 
 
 def test_violated_scaling_conditions_fail_a_solve():
-    # They hold on the interval that was checked, and not beyond.
+    # They hold on the interval that was checked, but not beyond.
     scaling = dps.Scaling(jnp.log, lambda t: t**3 / 6, rising, t0=0.5, t1=1.9)
     H = dps.BregmanHamiltonian(dps.EuclideanMirror(), objective, scaling)
     good = solve(H, dps.Strang(), 1.0, 1.9, 0.1, (Q, P), throw=False)
@@ -374,7 +374,7 @@ def failing(mirror_map, solver, q, p, h=0.5):
 @pytest.mark.parametrize(
     "mirror_map, q, p",
     [
-        # Beyond the dual domain, outside of the domain, and too far for Newton.
+        # Outside the dual domain, outside the domain, no convergence of the root find.
         (dps.LogBarrierMirror(), Q, 10 + P),
         (dps.EntropyMirror(), -Q, P),
         (dps.EntropyMirror(), Q, 1e4 + P),
@@ -430,11 +430,11 @@ def test_bad_parts_are_an_error(make, message):
 
 
 def from_parameters(theta, own):
-    """A number for the mirror map, and two for the scaling."""
+    """From one parameter of the mirror map and two of the scaling."""
     shape, c, C = theta
     scaling = dps.PolynomialScaling(c, C)
     if own:
-        # Its conditions cannot be checked while the numbers are unknown.
+        # The conditions cannot be checked while the parameters are traced.
         c = 0.4 * c
         beta = lambda t: C * c * t**2 / 2
         gamma = lambda t: c * t**2 / 2

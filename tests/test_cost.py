@@ -1,4 +1,4 @@
-"""What a step costs: evaluations of the force, counted at run time."""
+"""The cost of a step: evaluations of the force, counted at run time."""
 
 from typing import Any
 
@@ -14,11 +14,11 @@ from diffrax_presym._scan import equations
 
 
 class Counter:
-    """Velocity and force of an oscillator that count how often they are computed.
+    """Velocity and force of an oscillator that count their evaluations.
 
-    A pure callback, because XLA drops it where its value is not used, as it drops any
-    other force: the slopes for dense output of a solve that saves only its end, say. A
-    debugging callback has an effect and would be counted although nobody needs it.
+    XLA removes a pure callback whose value is not used, as it removes any other unused
+    force, for example in the derivatives for dense output of a solve that saves only
+    its final state. A debugging callback has a side effect and would still be counted.
     """
 
     def __init__(self):
@@ -39,7 +39,7 @@ class Counter:
         def counted(x):
             return jax.pure_callback(count, jax.ShapeDtypeStruct(x.shape, x.dtype), x)
 
-        # Dense output of high order differentiates the vector field.
+        # Dense output for high order differentiates the vector field.
         counted.defjvp(lambda x, dx: (counted(*x), *dx))
         return counted(x)
 
@@ -59,7 +59,7 @@ def count(solver, **kwargs):
 @each(kinds=("frozen", "split", *ANY))
 def test_force_evaluations_per_step(scheme: Scheme):
     forces = count(scheme.solver).forces
-    # What a step ends with may start the next; the first has to be computed.
+    # The force at the end of a step may be reused; the first has to be evaluated.
     assert forces in (STEPS * scheme.evaluations, STEPS * scheme.evaluations + 1)
 
 
@@ -82,7 +82,7 @@ def test_dense_output_of_the_leapfrog(first, extra):
     assert dense - plain == extra * STEPS
 
 
-# What is traced, and so could be computed.
+# Traced evaluations, an upper bound.
 
 
 def trace(hamiltonian, solver, made_jump: Any = False):
@@ -111,7 +111,7 @@ EXPONENTIALS = {"exp", "exp2", "expm1", "log", "log1p", "pow"}
 def test_undamped_systems_trace_no_exponential(scheme: Scheme):
     undamped = dps.SeparableHamiltonian(dps.QuadraticKinetic(), harmonic)
     assert not EXPONENTIALS & primitives(trace(undamped, scheme.solver))
-    # The measure sees those that are there.
+    # The counter does count evaluations.
     assert EXPONENTIALS & primitives(trace(oscillator(), scheme.solver))
 
 
@@ -132,7 +132,7 @@ def test_the_size_of_a_composition_does_not_grow_with_its_stages():
 
 @each(
     [scheme for scheme in SCHEMES if scheme.evaluations > 5],
-    kinds=("frozen", *ANY),  # exact drifts may have small loops of their own
+    kinds=("frozen", *ANY),  # exact drifts may contain small loops
 )
 def test_many_stages_run_in_one_loop(scheme: Scheme):
     traced = trace(oscillator(), scheme.solver)

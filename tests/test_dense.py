@@ -1,4 +1,4 @@
-"""Dense output: as accurate between the steps as the scheme is at their ends."""
+"""Dense output: its order between steps, and its values at the steps."""
 
 import functools
 
@@ -92,7 +92,7 @@ def test_derivative_is_the_vector_field(name):
 
 
 def test_differences_within_a_step():
-    # Of a whole solution Diffrax can take them only if the state is one array.
+    # For a whole solution, Diffrax supports them only if the state is one array.
     term, solver = dps.HamiltonianTerm(SYSTEM), dps.BlanesMoanRKN6()
     t0, t1 = jnp.array(0.0), jnp.array(0.3)
     carry = solver.init(term, t0, t1, Y0, None)
@@ -148,12 +148,12 @@ def test_dense_output_under_vmap():
         assert_close(jax.tree.map(lambda y, i=i: y[i], batch), at(scale, t), 1e-14)
 
 
-# What holds for every scheme, and in both directions of time.
+# Properties of every scheme, in both directions of time.
 
 
 @eqx.filter_jit
 def at_the_steps(sol):
-    """Value and slope there, and what the slope should be."""
+    """Value and derivative at the steps, and the expected derivative."""
     term = dps.HamiltonianTerm(SYSTEM)
     expected = jax.vmap(lambda t, y: term.vf(t, y, None))(sol.ts, sol.ys)
     return jax.vmap(lambda t: (sol.evaluate(t), sol.derivative(t)))(sol.ts), expected
@@ -212,7 +212,7 @@ def test_a_quintic_is_no_cubic():
 
 @pytest.mark.parametrize("second", [False, True], ids=["cubic", "quintic"])
 def test_a_step_of_no_length_has_a_derivative(second):
-    # Such as `vmap` takes where one solve is over before the others.
+    # As under `vmap`, when one solve terminates before the others.
     step = hermite(QUINTIC, 1.0, 1.0, second)
 
     def first(y0):

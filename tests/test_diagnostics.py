@@ -1,4 +1,4 @@
-"""The measures that users are given, against what is known."""
+"""The public diagnostics, against known values."""
 
 import diffrax as dfx
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""In `diffeqsolve`, as a built-in solver would be."""
+"""Behaviour in `diffeqsolve`, as for a built-in solver."""
 
 import diffrax as dfx
 import equinox as eqx
@@ -30,7 +30,7 @@ import diffrax_presym as dps
 
 
 def swing(t, q, args):
-    """A pendulum whose pivot is shaken."""
+    """A pendulum with an oscillating pivot."""
     return args * (1 + 0.3 * jnp.sin(2 * t)) * jnp.sum(1 - jnp.cos(q))
 
 
@@ -44,7 +44,7 @@ STEP = 1 / 32
 
 
 def of(*names):
-    """Where one scheme of a family speaks for the others."""
+    """Parametrise over single schemes that represent their families."""
     return each([scheme for scheme in SCHEMES if scheme.name in names])
 
 
@@ -65,7 +65,7 @@ def run(term, solver, t0, t1, dt0, y0, solver_state, args=ARGS):
 
 
 def go(scheme, t0, t1, y0, solver_state=None):
-    """The end of a solve, and what is carried on from there."""
+    """The final state and the solver state of a solve."""
     t0, t1, dt0 = jnp.array(t0), jnp.array(t1), jnp.array(np.copysign(STEP, t1 - t0))
     if solver_state is None:
         solver_state = start(TERM, scheme.solver, t0, y0)
@@ -75,7 +75,7 @@ def go(scheme, t0, t1, y0, solver_state=None):
 
 @eqx.filter_jit
 def march(term, solver, times, y0, args=ARGS):
-    """The same steps, taken by hand."""
+    """The same steps in a hand-written loop."""
 
     def one(carry, span):
         y, state = carry
@@ -89,7 +89,7 @@ def march(term, solver, times, y0, args=ARGS):
 
 @pytest.fixture(scope="module")
 def exact():
-    """The solution between the times 1 and 3, by another method."""
+    """The solution at times 2 and 3, by another method."""
     controller = dfx.PIDController(rtol=1e-12, atol=1e-12)
     ts = jnp.array([2.0, 3.0])
     sol = dfx.diffeqsolve(
@@ -148,7 +148,7 @@ def test_saving_steps_ends_and_times(scheme: Scheme):
     assert_close(ys["t0"], at(0), 0)
     assert_close(ys["t1"], at(-1), 1e-14)
     assert_close(ys["function"], TIMES + by_hand[0][:, 0], 1e-14)
-    # Exact at the steps, and in between as good as the interpolation.
+    # Exact at the steps, and as accurate as the interpolation in between.
     at_steps = jtu.tree_map(lambda y: y[jnp.array([0, 1, 3])], ys["ts"])
     assert_close(at_steps, at(0, 2, 6), 1e-14)
 
@@ -180,7 +180,7 @@ def test_a_step_that_does_not_divide_the_span(scheme: Scheme, exact):
     assert_close(last, exact(2.0), accuracy(scheme))
 
 
-# Going on
+# Continuing a solve
 
 
 @each(WAYS)
@@ -214,7 +214,7 @@ def test_a_momentum_first_leapfrog_carries_the_force_at_the_end():
 def test_there_and_back(scheme: Scheme):
     y, state = go(scheme, 1.0, 2.0, Y0)
     if scheme.kind in ANY:
-        # The copies are part of where it is; their field looks the other way in time.
+        # The copies are part of the state, and are reversed as well.
         y_back, _ = go(scheme, 2.0, 1.0, y, state)
     else:
         y_back, _ = go(scheme, 2.0, 1.0, y)
@@ -223,14 +223,14 @@ def test_there_and_back(scheme: Scheme):
 
 @each(WAYS)
 def test_backwards_the_past_is_found(scheme: Scheme, exact):
-    # Logarithmic damping has no past before the time 0: the physical time is what
-    # counts, not the one that Diffrax counts upwards.
+    # Logarithmic damping is not defined before time 0, so the damping must be
+    # evaluated at the physical time, not at Diffrax's reversed time.
     y_past, _ = go(scheme, 3.0, 1.0, exact(3.0))
     assert_close(y_past, Y0, 10 * accuracy(scheme))
 
 
 def test_negative_times():
-    # The same system by the clock of another, ahead by four.
+    # The same system with the time shifted by four.
     y, _ = go(SCHEMES[2], 1.0, 2.0, Y0)
     early = dps.ConformalHamiltonian(
         KINETIC, lambda t, q, args: swing(t + 4, q, args), dps.LogDamping(1.5, shift=4)
@@ -240,16 +240,16 @@ def test_negative_times():
     assert_close(jtu.tree_map(lambda y: y[-1], sol.ys), y, 1e-13)
 
 
-# Step sizes that adapt
+# Adaptive step sizes
 
 
 def two_forces(t, q, args):
-    """A force of 1 until the time 0.4, and of -2 from then on."""
+    """A force of 1 before time 0.4, and of -2 afterwards."""
     return -jnp.where(t < 0.4, 1.0, -2.0) * jnp.sum(q)
 
 
 FALL = dps.HamiltonianTerm(dps.SeparableHamiltonian(dps.QuadraticKinetic(), two_forces))
-# The stages of a triple jump leave the step, and look across the jump.
+# The stages of a triple jump lie outside the step, on the other side of the jump.
 WITHIN = [
     scheme
     for scheme in SCHEMES
@@ -262,8 +262,8 @@ WITHIN = [
     kinds=("frozen", "split", "quadratic"),
 )
 def test_jumps_of_the_force(scheme: Scheme):
-    # These schemes are exact where the force is constant: a force carried across the
-    # jump is the only error there could be.
+    # These schemes are exact for a constant force, so the only possible error is that
+    # of a force that is reused across the jump.
     controller = dfx.ClipStepSizeController(
         dfx.PIDController(rtol=1e-3, atol=1e-3), jump_ts=jnp.array([0.4])
     )
@@ -298,11 +298,11 @@ def test_half_steps_estimate_the_error(scheme: Scheme, exact):
 
     sol = adapt(Y0)
     assert_close(jtu.tree_map(lambda y: y[-1], sol.ys), exact(2.0), 20 * tolerance)
-    # It did adapt: the steps are not those of `dt0`.
+    # The steps are adaptive, not those of `dt0`.
     assert sol.stats["num_accepted_steps"] != 100
 
 
-# States of all kinds
+# States of several structures
 
 
 class Body(eqx.Module):
@@ -389,7 +389,7 @@ def test_precision_is_that_of_the_input(scheme: Scheme, dtype):
     assert len(floats) > 10 and set(floats) == {np.dtype(dtype)}
 
 
-# Ends
+# Termination
 
 
 @each(CARRIES)
@@ -460,13 +460,13 @@ def test_semi_implicit_euler_is_presymplectic_euler_without_damping():
     force = dfx.ODETerm(lambda t, q, args: -jnp.sin(q))
     span = (0.0, 1.0, 0.125, Y0)
     theirs = dfx.diffeqsolve((velocity, force), dfx.SemiImplicitEuler(), *span)
-    # Theirs moves the first of its pair with the second as it was: position first.
+    # Diffrax's solver first updates the first of its pair: position first.
     solver = dps.PresymplecticEuler("position")
     ours = dfx.diffeqsolve(dps.HamiltonianTerm(hamiltonian), solver, *span)
     assert_close(ours.ys, theirs.ys, 1e-14)
 
 
-# Schemes inside of schemes
+# Nested schemes
 
 
 @each(WAYS)
@@ -510,7 +510,7 @@ def test_implicit_schemes_solve(scheme: Scheme):
     assert_close(sol.ys, exact.ys, accuracy(scheme))
 
 
-# Its implicit equations have no real solution from this state at the step of the test.
+# Its implicit equations have no real solution for the state and step size below.
 HOPELESS = dps.Hamiltonian(lambda t, q, p, args: jnp.sum(q**2 * p + q * p**2))
 
 
@@ -561,7 +561,7 @@ def test_a_second_call_is_not_traced_again(scheme: Scheme):
     end(system(0.1, 1.0), scheme.solver, Y0)
     times = len(traced)
     assert times > 0
-    # Another of the same structure, and a copy of the solver.
+    # Another Hamiltonian of the same structure, and a copy of the solver.
     end(system(0.2, 2.0), jtu.tree_map(lambda x: x, scheme.solver), Y0)
     assert len(traced) == times
 
@@ -574,11 +574,11 @@ def test_a_step_is_the_same_in_a_solve_and_alone(scheme: Scheme):
     assert_close(solved, y, 1e-15)
 
 
-# Splittings, of which the tests above have none
+# Splittings, which are not covered by the tests above
 
 SPLITTINGS = [
-    Scheme("rkn_4", dps.BlanesMoanRKN4(), 4, 6, kind="quadratic"),  # carries a force
-    Scheme("rkn_6", dps.BlanesMoanRKN6(), 6, 14, kind="quadratic"),  # carries nothing
+    Scheme("rkn_4", dps.BlanesMoanRKN4(), 4, 6, kind="quadratic"),  # state: a force
+    Scheme("rkn_6", dps.BlanesMoanRKN6(), 6, 14, kind="quadratic"),  # state: none
 ]
 
 
@@ -632,11 +632,11 @@ def test_adjoints_agree(scheme: Scheme):
 
 
 def jolt(t, q, args):
-    """A pendulum that is pushed to one side until 1.4, and to the other from then."""
+    """A pendulum with a constant force that changes sign at time 1.4."""
     return args * jnp.sum(1 - jnp.cos(q)) + jnp.where(t < 1.4, -1.0, 2.0) * jnp.sum(q)
 
 
-# It converges. That the force carried is new at the jump is what constant forces show.
+# Convergence only. `test_jumps_of_the_force` tests that the force is recomputed.
 @pytest.mark.slow
 @of("leapfrog_AB", "tao")
 def test_a_clipped_solve_is_two_solves(scheme: Scheme):
@@ -651,8 +651,8 @@ def test_a_clipped_solve_is_two_solves(scheme: Scheme):
         )
         return jtu.tree_map(lambda y: y[-1], sol.ys), sol.stats["num_steps"]
 
-    # On either side of the jump the force is smooth, if the jump is left out. The last
-    # step of the first part ends just before it.
+    # The force is smooth on either side of the jump. The last step of the first part
+    # ends just before the jump.
     before = jnp.nextafter(jnp.array(1.4), jnp.array(0.0))
     jump_ts, none = jnp.array([1.4]), jnp.array([9.0])
     reference, tight = dfx.Tsit5(), jnp.array(1e-10)

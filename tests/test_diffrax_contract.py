@@ -1,7 +1,7 @@
-"""What this package relies on in Diffrax without a promise, one sentence each.
+"""Undocumented behaviour of Diffrax that this package relies on.
 
-Should one of these fail after an update of Diffrax, nothing else need be wrong: mend
-`diffrax_presym/_term.py` or `diffrax_presym/_solver/_base.py` accordingly.
+If one of these tests fails after an update of Diffrax, adapt `diffrax_presym/_term.py`
+or `diffrax_presym/_solver/_base.py` accordingly.
 """
 
 from typing import ClassVar
@@ -22,7 +22,7 @@ Y0 = (jnp.ones(1), jnp.ones(1))
 
 
 class Recorder(dfx.AbstractSolver):
-    """Diffrax's own Euler method, which writes down what it is called with."""
+    """Euler's method, which records its arguments."""
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar = dfx.LocalLinearInterpolation
@@ -55,9 +55,9 @@ def test_the_term_arrives_in_a_wrapper_with_term_and_direction(call):
     wrapped = record()[call]
     assert not isinstance(wrapped, dps.HamiltonianTerm) and isinstance(
         getattr(wrapped, "term", None), dps.HamiltonianTerm
-    ), "`diffeqsolve` no longer hands a solver its term in a wrapper with `.term`."
+    ), "`diffeqsolve` no longer passes the term in a wrapper with `.term`."
     assert eqx.is_array(getattr(wrapped, "direction", None)), (
-        "The wrapper of a term no longer has `.direction`, the sign of time."
+        "The wrapper of a term no longer has a `.direction`, the sign of time."
     )
 
 
@@ -72,14 +72,14 @@ def test_direction_is_the_sign_of_time(t1, sign):
     assert sol.ys is not None
     direction, end = sol.ys
     assert direction == sign and end == abs(t1), (
-        "The wrapper's `.direction` is no longer 1 or -1, by which time is multiplied."
+        "The wrapper's `.direction` is no longer 1 or -1, a factor of the time."
     )
 
 
 def test_made_jump_is_false_under_constant_step_sizes():
     assert record()["made_jump"] is False, (
-        "`made_jump` is no longer the Python value `False` under `ConstantStepSize`: a "
-        "branch is traced, and the carried force kept for nothing."
+        "`made_jump` is no longer the Python value `False` under `ConstantStepSize`: "
+        "an unnecessary branch is traced."
     )
 
 
@@ -112,13 +112,13 @@ def test_the_term_of_backsolve_adjoint_is_called_adjoint_term():
     eqx.filter_eval_shape(gradient, Y0)
     inner = getattr(recorder.seen["init"], "term", recorder.seen["init"])
     assert type(inner).__name__ == "AdjointTerm", (
-        "`BacksolveAdjoint` no longer solves an `AdjointTerm`, by whose name its users "
-        "are told what to write instead."
+        "`BacksolveAdjoint` no longer solves an `AdjointTerm`, by whose name it is "
+        "detected for an error message."
     )
 
 
 class Interpolation(dfx.AbstractLocalInterpolation):
-    """One that takes whatever it is given, and writes it down."""
+    """An interpolation that accepts and records any arguments."""
 
     t0: jax.Array
     t1: jax.Array
@@ -137,7 +137,7 @@ class Interpolating(Recorder):
     built: ClassVar[list] = []
 
 
-# Within the loop, and by what a solution of dense output does after it.
+# Within the loop, and in dense output after it.
 @pytest.mark.parametrize("saveat", [dict(ts=jnp.array([-0.5])), dict(dense=True)])
 def test_interpolations_are_made_of_times_and_dense_info(saveat):
     Interpolating.built.clear()
@@ -148,11 +148,11 @@ def test_interpolations_are_made_of_times_and_dense_info(saveat):
         return sol.evaluate(-0.5) if saved.dense else sol.ys
 
     eqx.filter_eval_shape(run)
-    assert Interpolating.built, "`interpolation_cls` is no longer what is called."
+    assert Interpolating.built, "`interpolation_cls` is no longer called."
     for args, kwargs in Interpolating.built:
         assert not args and set(kwargs) == {"t0", "t1", "y0", "y1"}, (
             "`interpolation_cls` is no longer called with `t0`, `t1` and the entries "
-            "of `dense_info`, all by name."
+            "of `dense_info` as keyword arguments."
         )
 
 
@@ -168,13 +168,13 @@ def test_times_are_arrays_of_one_precision(call):
             times.extend((t0, t1) if call == "step" else ())
             return super().step(terms, t0, t1, *args)
 
-    # Of Python numbers of several kinds, an integer too.
+    # From Python numbers of several types, including an integer.
     run = lambda: dfx.diffeqsolve(TERM, Clock(), 0, 1.0, 0.1, Y0).ys
     eqx.filter_eval_shape(run)
     assert times and all(isinstance(t, jax.Array) for t in times), (
-        "A solver is no longer given times that are arrays: Python numbers would be "
-        "upcast, and have no `.dtype`."
+        "Times are no longer passed to a solver as arrays: Python numbers would be "
+        "promoted, and have no `.dtype`."
     )
     assert {(t.shape, t.dtype) for t in times} == {((), jnp.dtype("float64"))}, (
-        "A solver is no longer given times of one floating precision."
+        "Times are no longer passed to a solver in one floating-point precision."
     )

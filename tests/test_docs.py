@@ -1,4 +1,4 @@
-"""What the documentation shows runs, and what is public is documented."""
+"""The code of the documentation runs, and all public names are documented."""
 
 import inspect
 import pathlib
@@ -40,7 +40,7 @@ REFERENCE = re.compile(
 
 
 def docstrings(value):
-    """The docstring of an object, and of what it defines itself."""
+    """The docstrings of an object and of its own members."""
     members = vars(value).values() if inspect.isclass(value) else ()
     objects = [value, *(x for x in members if callable(x) or isinstance(x, property))]
     return [inspect.getdoc(x) or "" for x in objects]
@@ -48,7 +48,7 @@ def docstrings(value):
 
 @pytest.fixture
 def as_user(tmp_path, monkeypatch):
-    """JAX as it is imported, and a place to save figures to."""
+    """JAX with its default settings, and a directory for figures."""
     settings = {
         "jax_enable_x64": False,
         "jax_numpy_dtype_promotion": "standard",
@@ -72,7 +72,7 @@ def run(blocks, name, namespace):
         exec(compile(block, f"{name}, block {number}", "exec"), namespace)
 
 
-# `plt.show()` shows nothing here, and says so.
+# `plt.show()` warns that the backend is not interactive.
 @pytest.mark.filterwarnings("ignore:.*is non-interactive:UserWarning")
 @pytest.mark.parametrize("page", PAGES, ids=lambda x: str(x.relative_to(ROOT)))
 def test_page_runs(page, as_user):
@@ -82,7 +82,7 @@ def test_page_runs(page, as_user):
 @pytest.mark.parametrize("name", PUBLIC)
 def test_docstring_runs(name, as_user):
     blocks = [x for doc in docstrings(PUBLIC[name]) for x in python_blocks(doc)]
-    # Docstrings leave out the imports that anyone would guess.
+    # Docstrings omit the usual imports.
     usual = {"dfx": dfx, "dps": dps, "eqx": eqx, "jax": jax, "jnp": jnp, "np": np}
     run(blocks, name, {**vars(dfx), **PUBLIC, **usual, "optx": optx})
 
@@ -124,7 +124,7 @@ def test_docstring_is_complete(name):
     ):
         assert re.search(r"\border\b|\bcost per step\b", doc, re.IGNORECASE)
         assert "dense/ts output" in doc.replace("\n", " ").lower()
-    # Whatever a user calls with arguments documents each of them.
+    # Every argument of a public constructor is documented.
     if inspect.isabstract(value) or name in DOCUMENTED_AS_A_WHOLE:
         return
     arguments = list(inspect.signature(value).parameters)
@@ -135,7 +135,7 @@ def test_docstring_is_complete(name):
         assert f"`{argument}`" in explained, argument
 
 
-# Records, whose fields the docstring of the class explains; made by no user.
+# Records whose fields are documented in the class docstring; not created by users.
 DOCUMENTED_AS_A_WHOLE = {"HermiteInterpolation", "SplittingTableau"}
 
 

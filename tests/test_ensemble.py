@@ -16,8 +16,8 @@ IN_EACH_STEP = {"constant steps, an event", "adaptive steps"}
 
 
 def run(tmp_path, *options, limit):
-    """How the example ends, and what it prints; nothing of it is left running."""
-    # How this process runs JAX is no concern of the example.
+    """The exit code and output of the example; all its processes are terminated."""
+    # The example does not inherit the JAX settings of this process.
     environment = {k: v for k, v in os.environ.items() if not k.startswith("XLA_")}
     environment |= {"JAX_PLATFORMS": "cpu", "MPLBACKEND": "Agg"}
     process = subprocess.Popen(
@@ -39,7 +39,7 @@ def run(tmp_path, *options, limit):
 
 
 def reports(output):
-    """What each process says of its part: `(difference, communication)`."""
+    """The report of each process: `(difference, communication)`."""
     lines = [line for line in output.splitlines() if line.startswith("process ")]
     found = []
     for line in sorted(lines):
@@ -57,13 +57,13 @@ def test_over_devices(tmp_path):
     assert (tmp_path / "ensemble.png").stat().st_size > 0
     assert "over 8 x cpu in 1 process(es), 512 on each device" in output
     ((difference, communication),) = reports(output)
-    # Bitwise as measured; compilers may round the remainder of a vector otherwise.
+    # Bitwise equal in our runs; compilers may round remainders of vectors differently.
     assert difference < 1e-9
     assert communication == "none"
     table = output.split("Communication in the compiled program")[1]
     rows = {line[2:36].strip(): line[36:] for line in table.splitlines()[1:]}
     assert {name for name in rows if rows[name] == "none"} >= FREE
-    # The search for such operations finds them where they must be.
+    # The search finds collective operations where they are expected.
     assert {name for name in rows if "in each step" in rows[name]} == IN_EACH_STEP
 
 
@@ -82,7 +82,7 @@ def test_over_processes(tmp_path):
 
 def test_processes_end_at_the_limit(tmp_path):
     options = "--processes", "2", "--timeout", "0.5"
-    # It returns only when all have ended that could write to its output.
+    # It returns only when all processes that could write to its output have ended.
     code, output, _ = run(tmp_path, *options, limit=100)
     assert code == 1
-    assert "Picture" not in output
+    assert "Figure" not in output

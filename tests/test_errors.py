@@ -1,6 +1,6 @@
-"""Bad input gets a clear error before any compute.
+"""Invalid input raises a clear error before any computation.
 
-Each message says what was given, what is needed, and what to write instead.
+Each message says what was given, what is expected, and what to write instead.
 """
 
 import re
@@ -32,7 +32,7 @@ NONSEPARABLE = {
 
 
 def trace(term, solver, y0=PAIR, **kwargs):
-    """Trace a solve. Nothing is computed, so what is raised is raised before."""
+    """Trace a solve, without computing it, so errors are raised at trace time."""
     dtype = kwargs.pop("dtype", jnp.float64)
     t0, t1, dt0 = (jnp.array(t, dtype) for t in (0.0, 1.0, 0.1))
     run = lambda y0: dfx.diffeqsolve(term, solver, t0, t1, dt0, y0, **kwargs).ys
@@ -40,7 +40,7 @@ def trace(term, solver, y0=PAIR, **kwargs):
 
 
 def system(kinetic: Callable = KINETIC, potential=harmonic, **kwargs):
-    """Trace a solve of a system whose parts are wrong."""
+    """Trace a solve of a system with invalid parts."""
     hamiltonian = dps.ConformalHamiltonian(kinetic, potential, **kwargs)
     trace(dps.HamiltonianTerm(hamiltonian), LEAPFROG)
 
@@ -103,7 +103,7 @@ STATES = {
 @pytest.mark.parametrize("y0, mistake", list(STATES.values()), ids=list(STATES))
 @pytest.mark.parametrize("solver", [LEAPFROG, dfx.Tsit5()], ids=["ours", "Diffrax's"])
 def test_states(y0, mistake, solver):
-    # In single precision: `diffeqsolve` takes states to the precision of time at least.
+    # In single precision, as `diffeqsolve` promotes states to the precision of time.
     with pytest.raises(ValueError) as error:
         trace(TERM, solver, y0, dtype=jnp.float32)
     mistake.check(error)
@@ -153,7 +153,7 @@ def test_several_terms_in_one():
 
 
 def test_the_terms_of_semi_implicit_euler():
-    # Refused by Diffrax before a solver is asked, which says that one term is expected.
+    # Raised by Diffrax before the solver is called; it says that one term is expected.
     with pytest.raises(ValueError) as error:
         trace((ODE, ODE), LEAPFROG)
     message = "Terms are not compatible with solver"
@@ -176,7 +176,7 @@ def test_backsolve_adjoint_with_the_same_solver():
         assert sol.ys is not None
         return jnp.sum(sol.ys[0])
 
-    loss(PAIR)  # The solve itself has nothing to complain of.
+    loss(PAIR)  # The solve itself succeeds.
     with pytest.raises(ValueError) as error:
         eqx.filter_eval_shape(jax.grad(loss), PAIR)
     instead = "`BacksolveAdjoint(solver=diffrax.Tsit5())`"
@@ -195,11 +195,11 @@ def test_backsolve_adjoint_with_the_solver_it_is_told_to_use():
         return jax.grad(loss)(PAIR)
 
     backsolve = gradient(dfx.BacksolveAdjoint(solver=dfx.Tsit5()))
-    # To the error of the leapfrog, as the adjoint equations are not those of its steps.
+    # Up to the error of the leapfrog, as the adjoint equations are continuous.
     assert_close(backsolve, gradient(dfx.RecursiveCheckpointAdjoint()), 1e-4)
 
 
-# Energies that a scheme cannot step
+# Energies that a scheme does not support
 
 PARTS = (
     "`SeparableHamiltonian(kinetic, potential)`",
@@ -214,7 +214,7 @@ def test_nonseparable_energies_need_a_root_finder(scheme: Scheme, hamiltonian):
         trace(dps.HamiltonianTerm(hamiltonian), scheme.solver)
     message = str(error.value)
     assert f"This `{type(hamiltonian).__name__}` is not separable" in message
-    # All three ways out.
+    # All three alternatives.
     assert "`root_finder=optimistix.Newton(rtol=1e-10, atol=1e-10)`" in message
     assert "`PresymplecticCoupled()`" in message
     assert all(parts in message for parts in PARTS)
@@ -259,11 +259,11 @@ def test_nystroem_splittings_need_a_quadratic_kinetic_energy(solver, hamiltonian
 
 @pytest.mark.parametrize("solver", [LEAPFROG, dps.PresymplecticTao()])
 def test_step_sizes_by_error_estimate(solver):
-    # The message is Diffrax's, which does not ask the solver for one.
+    # The message is Diffrax's and cannot be changed by the solver.
     controller = dfx.PIDController(rtol=1e-3, atol=1e-3)
     with pytest.raises(RuntimeError, match="solver that does not provide error est"):
         trace(TERM, solver, stepsize_controller=controller)
-    # What to write instead is in the documentation of the solvers.
+    # The alternative is described in the documentation of the solvers.
     assert "`diffrax.HalfSolver`" in str(dps.AbstractPresymplecticSolver.__doc__)
     trace(TERM, dfx.HalfSolver(solver), stepsize_controller=controller)
 
@@ -688,13 +688,13 @@ def test_masses_not_yet_known_are_not_judged():
     assert mass.shape == ()
 
 
-# A root that is not found is a result, not a number as if nothing had happened.
+# A root that is not found gives an unsuccessful result.
 
 NOT_FOUND = "maximum number of steps was reached in the nonlinear solver"
 
 
 def hard_energy(t, q, p, args):
-    """Not separable, but linear for a root finder except from one time to another."""
+    """Not separable, and linear for a root finder except in a time interval."""
     start, end = args
     hard = jnp.where((t >= start) & (t <= end), 1.0, 0.0)
     return jnp.sum(q**2 + p**2) / 2 + hard * mixed_energy(t, q, p, None)
@@ -714,18 +714,18 @@ def window(start, end):
     return jnp.array(start), jnp.array(end)
 
 
-# Two steps of Newton's method solve a linear equation, and make sure of it.
+# Two steps of Newton's method solve a linear equation and confirm convergence.
 FINDER, STEPS = optx.Newton(rtol=1e-10, atol=1e-10), 2
 LEAPFROG_AB = dps.PresymplecticLeapfrog("momentum", FINDER, STEPS)
 LEAPFROG_BA = dps.PresymplecticLeapfrog("position", FINDER, STEPS)
-# And times at which alone a root cannot be found.
+# Schemes, and the times at which their root finds fail.
 UNSOLVED = {
     "euler_A": (dps.PresymplecticEuler("momentum", FINDER, STEPS), (0.0, 0.5)),
     "euler_B": (dps.PresymplecticEuler("position", FINDER, STEPS), (0.5, 1.0)),
-    # The first of a step or the last of one.
+    # The first or the last root find of a step.
     "leapfrog_AB": (LEAPFROG_AB, (0.0, 1.0)),
     "leapfrog_BA": (LEAPFROG_BA, (0.125, 0.875)),
-    # The first of all stages or the last.
+    # The first or the last stage.
     "suzuki_yoshida": (dps.SuzukiYoshida(4, base=LEAPFROG_AB), (0.0, 1.0)),
     "substeps": (dps.Substeps(LEAPFROG_AB, 2), (0.0, 1.0)),
 }

@@ -1,4 +1,4 @@
-"""Events: when they happen, how that depends on parameters, and how to go on."""
+"""Events: their times, derivatives of these, and continuation after events."""
 
 import diffrax as dfx
 import equinox as eqx
@@ -39,7 +39,7 @@ def past_the_bottom(t, y, args, **kwargs):
 
 
 def swing(solver, dt0, cond_fn=through_the_bottom, gamma=GAMMA, q0=1.5, **kwargs):
-    """A pendulum let go, until the event or t = 10."""
+    """A pendulum released at rest, until the event or t = 10."""
     return dfx.diffeqsolve(
         dps.HamiltonianTerm(system(gamma)),
         solver,
@@ -73,7 +73,7 @@ def exact():
     ],
 )
 def test_event_is_as_accurate_as_dense_output(solver, order, exact):
-    # Steps that meet the event at odd points, so that it is not at the end of one.
+    # Step sizes for which the event is not at the end of a step.
     errors = []
     for h in (0.31, 0.31 / 4):
         t, q, p = last(swing(solver, h))
@@ -150,7 +150,7 @@ def test_a_restart_from_the_state_alone_is_fresh(stopped):
     )
     fresh = restart(stopped, solver)
     assert_close(fresh, jax.tree.map(lambda y: y[-1], sol.ys), 2e-5)
-    # Carrying the stale force on is wrong, and saying that a jump was made mends it.
+    # Reusing the stale force is wrong; with `made_jump` it is recomputed.
     state = stopped.solver_state
     jumped = restart(stopped, solver, solver_state=state, made_jump=jnp.array(True))
     assert_close(jumped, fresh, 1e-14)
@@ -158,10 +158,10 @@ def test_a_restart_from_the_state_alone_is_fresh(stopped):
     assert abs(stale[0] - fresh[0]) > 1e-5
 
 
-# What holds for every scheme
+# Properties of every scheme
 
 OMEGA = np.sqrt(1 - GAMMA**2 / 4)
-# Where the damped oscillator, let go at rest, first is at zero.
+# The first zero of the damped oscillator, released at rest.
 FIRST_ZERO = (np.pi - np.arctan2(2 * OMEGA, GAMMA)) / OMEGA
 
 
@@ -180,7 +180,7 @@ def oscillate(solver, t1, dt0):
 @each(CARRIES)
 def test_order_of_the_event_time(scheme: Scheme):
     errors = []
-    # The event at the same point of a step each time, or the error would jump about.
+    # The event is at the same fraction of a step each time, for a smooth error.
     steps = np.array([5, 10, 20]) + 0.37
     for n in steps:
         sol = oscillate(scheme.solver, jnp.array(3.0), jnp.array(FIRST_ZERO / n))
@@ -191,7 +191,7 @@ def test_order_of_the_event_time(scheme: Scheme):
     assert order > min(scheme.order, 6 if scheme.order > 4 else 4) - 0.5
 
 
-# Several at once
+# Several events
 
 
 def far(t, y, args, **kwargs):
@@ -232,7 +232,7 @@ def test_the_direction_of_an_event(upwards):
 
 
 def test_events_backwards_in_time():
-    # From a zero back to the turning point before it, where the oscillator was let go.
+    # From a zero back to the previous turning point, where the oscillator was released.
     w, e = OMEGA, np.exp(-GAMMA * FIRST_ZERO / 2)
     y = (jnp.array(0.0), jnp.array(-e * np.sin(w * FIRST_ZERO) / w))
     sol = dfx.diffeqsolve(
@@ -251,13 +251,13 @@ def test_events_under_vmap():
     solver, q0 = dps.PresymplecticLeapfrog(), jnp.array([0.5, 1.5, 2.5])
     time = lambda q0: last(swing(solver, 0.1, q0=q0))[0]
     together = jax.jit(jax.vmap(time))(q0)
-    assert np.all(np.diff(together) > 0.1)  # the further up the later
+    assert np.all(np.diff(together) > 0.1)  # larger amplitudes take longer
     for t, q in zip(together, q0, strict=True):
         assert abs(t - time(q)) < 1e-13
 
 
-# How to go on, for all that is carried: the force of a scheme inside of another, that
-# of a splitting, a copy.
+# Continuation, for each kind of solver state: the force of a nested scheme, that of a
+# splitting, a copy.
 
 GOING_ON = {
     "Yoshida": dps.PresymplecticYoshida4(),
@@ -282,12 +282,12 @@ def let_go(solver, t0, t1, y0, event=None, solver_state=None, made_jump=False):
     if solver_state is None:
         term = dps.HamiltonianTerm(system())
         solver_state = solver.init(term, t0, t1, y0, None)
-    # An array, so that with and without a jump are one compilation.
+    # An array, to compile once for both values.
     return _let_go(solver, t0, t1, y0, solver_state, jnp.array(made_jump), event)
 
 
 def every(sol):
-    """All that was saved."""
+    """All saved times and states."""
     saved = np.isfinite(sol.ts)
     return jax.tree.map(lambda x: x[saved], (sol.ts, *sol.ys))
 
@@ -302,16 +302,16 @@ START = jnp.array(0.0), jnp.array(4.0), (jnp.array(1.5), jnp.array(0.0))
 @pytest.mark.parametrize("solver", GOING_ON.values(), ids=GOING_ON)
 def test_where_a_solver_state_belongs(solver):
     whole = let_go(solver, *START)
-    # A boolean event ends with its step, and the solver state with it: going on from
-    # there is one solve, bit for bit.
+    # A boolean event is at the end of its step, to which the solver state belongs, so a
+    # continuation is bitwise equal to a single solve.
     stopped = let_go(solver, *START, event=dfx.Event(past_the_bottom))
     t, *y = ending(stopped)
     rest = let_go(solver, t, START[1], tuple(y), solver_state=stopped.solver_state)
     n = len(every(stopped)[0])
     assert_close(every(rest), jax.tree.map(lambda x: x[n - 1 :], every(whole)), 0)
 
-    # An event that a root finder looks for ends within that step, and the solver state
-    # is the same as before: of another point.
+    # With a root finder, the event is inside the step, but the solver state still
+    # belongs to its end.
     event = dfx.Event(through_the_bottom, FINDER)
     within = let_go(solver, *START, event=event)
     assert_close(within.solver_state, stopped.solver_state, 1e-14)
@@ -321,9 +321,9 @@ def test_where_a_solver_state_belongs(solver):
     carry = within.solver_state
     stale = let_go(solver, t, START[1], tuple(y), solver_state=carry)
     assert np.max(np.abs(flat(ending(stale)) - flat(ending(fresh)))) > 1e-4
-    # Saying that a jump was made mends it.
-    mended = let_go(solver, t, START[1], tuple(y), solver_state=carry, made_jump=True)
-    assert_close(ending(mended), ending(fresh), 1e-14)
+    # With `made_jump` the solver state is recomputed.
+    renewed = let_go(solver, t, START[1], tuple(y), solver_state=carry, made_jump=True)
+    assert_close(ending(renewed), ending(fresh), 1e-14)
 
 
 def test_nothing_is_saved_after_the_event():
@@ -358,7 +358,7 @@ def test_a_batch_of_which_some_have_an_event():
         saved = np.isfinite(alone[0])
         both = jax.tree.map(lambda a, b, i=i, s=saved: (a[i][s], b[s]), batch, alone)
         for together, single in both:
-            # Newton's method stops at its tolerance.
+            # Up to the tolerance of Newton's method.
             assert_close(together, single, 1e-11)
 
 

@@ -1,4 +1,4 @@
-"""Single precision: nothing overflows, and nothing is promoted."""
+"""Single precision: no overflow and no promotion."""
 
 import diffrax as dfx
 import equinox as eqx
@@ -53,7 +53,7 @@ def check_late_times(scheme, hamiltonian, t1):
     sol = solve(hamiltonian, scheme.solver, t0, t1, dt0, y0, max_steps=None)
     for leaf in jtu.tree_leaves(sol.ys):
         assert leaf.dtype == jnp.float32
-        # At the minimum, and not merely finite.
+        # Not only finite, but at the minimum.
         assert np.all(np.abs(leaf) < 1e-4)
 
 
@@ -68,8 +68,8 @@ def test_no_overflow_in_other_systems(scheme: Scheme, system):
     check_late_times(scheme, LATE[system], 1e4)
 
 
-# What a step returns keeps its precision. `diffeqsolve` would silently cast `y` back,
-# so look inside: parameters are doubles, time and state are not.
+# The outputs of a step have the precision of the state. `diffeqsolve` would silently
+# cast `y`, so single steps are tested: parameters are doubles, time and state are not.
 
 
 def cosine(t, q, args):
@@ -81,7 +81,7 @@ def soft_kinetic(t, p, args):
     return jnp.sum(jnp.sqrt(1 + p**2))
 
 
-# Not Python numbers, whose weak type would give way by itself.
+# Not Python numbers, as weak types would not be promoted.
 HALF, ONE, TWO, THREE = map(np.float64, (0.5, 1.0, 2.0, 3.0))
 DAMPING = dps.LogDamping(THREE, shift=ONE)
 SYSTEMS = {
@@ -117,7 +117,7 @@ NEEDS = {
 
 
 def step_dtypes(hamiltonian, solver, y, time=jnp.float32):
-    """The dtypes of all that a step returns: nothing is compiled for it."""
+    """The dtypes of all outputs of a step, without compiling it."""
     term = dps.HamiltonianTerm(hamiltonian)
     t = jax.ShapeDtypeStruct((), time)
 

@@ -1,4 +1,4 @@
-"""Gradients of a solve with respect to everything that goes into it."""
+"""Gradients of a solve with respect to all its inputs."""
 
 from collections.abc import Callable
 
@@ -20,7 +20,7 @@ class Learned(eqx.Module):
     network: eqx.nn.MLP
 
     def __init__(self):
-        # A bias at the end would be a constant of the potential, without effect.
+        # A final bias would be a constant of the potential, without effect.
         self.network = eqx.nn.MLP(
             *(2, "scalar", 4, 1),
             activation=jnp.tanh,
@@ -33,7 +33,7 @@ class Learned(eqx.Module):
 
 
 class Entangled(eqx.Module):
-    """An energy that is not separable, with the same inside."""
+    """A nonseparable energy that contains the same network."""
 
     mass: jax.Array
     potential: Callable
@@ -43,8 +43,8 @@ class Entangled(eqx.Module):
         return kinetic + self.potential(t, q, args)
 
 
-# Python numbers make arrays of weak type, and each leaf that then changes its type in a
-# step of a difference a compilation of its own.
+# Python numbers would give arrays of weak type, whose change of type in a finite
+# difference causes a recompilation.
 MASS, GAMMA, SHIFT, STIFFNESS = map(np.float64, (1.3, 0.4, 1.0, 0.8))
 SEPARABLE = dps.ConformalHamiltonian(
     dps.QuadraticKinetic(MASS), Learned(), dps.ConstantDamping(GAMMA)
@@ -82,14 +82,14 @@ value_and_gradient = eqx.filter_jit(eqx.filter_value_and_grad(loss))
 
 @eqx.filter_jit
 def along(inputs, direction, solver, saveat):
-    """The derivative along a direction, in forward mode."""
+    """The directional derivative, in forward mode."""
     arrays, rest = eqx.partition(inputs, eqx.is_inexact_array)
     fn = lambda arrays: loss(eqx.combine(arrays, rest), solver, FORWARD, saveat)
     return jax.jvp(fn, (arrays,), (direction,))[1]
 
 
 def directions(inputs):
-    """For each leaf that is differentiated a random direction in it alone."""
+    """One random direction for each differentiable leaf."""
     leaves, structure = jtu.tree_flatten(eqx.filter(inputs, eqx.is_inexact_array))
     random = np.random.default_rng(0)
     for i, leaf in enumerate(leaves):
@@ -110,7 +110,7 @@ def check(hamiltonian, solver, adjoint, saveat=None, vanishing=0):
         return reverse(eqx.apply_updates(inputs, step))[0]
 
     _, gradient = reverse(inputs)
-    # A gradient that is cut off somewhere would agree with itself in forward mode.
+    # Forward mode would not detect a `stop_gradient`.
     assert np.sum(gradient == 0) == vanishing
     for direction in directions(inputs):
         slope = gradient @ flat(direction)
@@ -134,8 +134,8 @@ def named(schemes, *names):
 CHECKPOINTED = dfx.RecursiveCheckpointAdjoint()
 
 
-# Compiling a gradient takes seconds, so one scheme stands for all that work alike:
-# nothing carried, a carried force through a loop over stages, a carried copy.
+# Compiling a gradient takes seconds, so one scheme of each kind is tested: without a
+# solver state, with a force and a loop over stages, with a copy.
 
 
 @each(named(SCHEMES, "euler_B", "suzuki_yoshida_4", "tao"))
@@ -162,12 +162,12 @@ def test_gradients_by_the_direct_adjoint():
 
 @pytest.mark.parametrize("law", [dps.ConstantDamping, dps.LogDamping])
 def test_gradients_without_damping(law):
-    # At zero the gradient with respect to gamma is that of the limit, and not NaN.
+    # The gradient with respect to gamma at zero is the limit, and not NaN.
     hamiltonian = dps.ConformalHamiltonian(
         dps.QuadraticKinetic(MASS),
         Learned(),
         law(0 * GAMMA) if law is dps.ConstantDamping else law(0 * GAMMA, shift=SHIFT),
     )
-    # The shift of time has no effect then.
+    # The shift of time has no effect in this case.
     vanishing = 1 if law is dps.LogDamping else 0
     check(hamiltonian, dps.PresymplecticLeapfrog(), CHECKPOINTED, vanishing=vanishing)

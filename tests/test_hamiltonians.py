@@ -1,4 +1,4 @@
-"""Hamiltonians are what their formulas say: derivatives, frames, vector fields."""
+"""Hamiltonians agree with their formulas: derivatives, momenta, vector fields."""
 
 from decimal import Decimal, localcontext
 
@@ -43,7 +43,7 @@ LOG, CONSTANT = dps.LogDamping(3.0, shift=0.5), dps.ConstantDamping(0.7)
 QUADRATIC, RELATIVISTIC = dps.QuadraticKinetic(MASS), dps.RelativisticKinetic(1.5, 2.0)
 
 
-# Hamiltonian, and H(t, q, P) as the paper writes it.
+# Hamiltonian, and H(t, q, P) as in the paper.
 
 
 def quadratic(P):
@@ -174,7 +174,7 @@ def test_canonical_momentum_there_and_back(hamiltonian, H):
 def test_vector_field_is_hamilton_s_equations(hamiltonian, H):
     canonical = hamiltonian.to_canonical(T, P)
     dq, dP = jax.grad(H, 2)(T, Q, canonical), -jax.grad(H, 1)(T, Q, canonical)
-    # The frame moves too.
+    # Including the time dependence of the momentum transformation.
     _, dp = jax.jvp(hamiltonian.from_canonical, (T, canonical), (jnp.ones_like(T), dP))
     field = dps.HamiltonianTerm(hamiltonian).vf(T, (Q, P), ARGS)
     assert_close(field, (dq, dp), 1e-13)
@@ -193,7 +193,7 @@ def test_equal_damping_is_conformal():
         assert_close(first, second, 1e-15)
 
 
-# Derivatives by hand.
+# User-defined derivatives.
 
 
 def test_velocity_and_force_by_hand_are_used_and_equal_autodiff():
@@ -232,7 +232,7 @@ def test_nonseparable_velocity_and_force_by_hand():
         assert_close(one, two, 1e-15)
 
 
-# Masses of every form.
+# Masses of all forms.
 
 P2 = jnp.array([[0.3, -0.2, 1.0], [0.5, 0.1, -0.4]])
 TREE = {"a": P, "b": (jnp.array(0.5), P2)}
@@ -318,7 +318,7 @@ def test_a_long_damped_frame_does_not_overflow():
 
 # Damping laws.
 
-# law, and eta(t) to fifty digits
+# Law, and eta(t) to fifty digits
 LAWS = {
     "constant": (CONSTANT, lambda t: Decimal("0.7") * t),
     "negative": (dps.ConstantDamping(-0.7), lambda t: Decimal("-0.7") * t),
@@ -347,7 +347,7 @@ def test_damping_law(law, eta):
     "dtype, tolerance", [(jnp.float32, 1e-6), (jnp.float64, 1e-14)]
 )
 def test_increments_are_exact_at_late_times(law, eta, h, dtype, tolerance):
-    # In `float32` a difference of two values of eta has no digit left here.
+    # In `float32` a difference of two values of eta would have no correct digit.
     t, h = jnp.array(1e4, dtype), jnp.array(h, dtype)
     increment = law.increment(t, h)
     assert increment.dtype == dtype
@@ -411,11 +411,11 @@ def test_a_relativistic_drift_through_friction_that_stops_it(dtype):
         q, _ = drift(system, start, jnp.ones((), dtype), jnp.zeros_like(p), p)
         return q
 
-    # By nodes that all come too late to see it move.
+    # The momentum decays before the first quadrature node.
     gamma = jnp.array(1e4, dtype)
     np.testing.assert_allclose(moved(gamma), 0.0, atol=1e-15)
     np.testing.assert_allclose(jax.jacrev(moved)(gamma), 0.0, atol=1e-15)
-    # The closed form, where there are enough nodes.
+    # Against the closed form, if there are enough nodes.
     mass, speed = float(RELATIVISTIC.mass), float(RELATIVISTIC.speed)
     sizes = 0.5 * np.array([1, np.exp(-0.5)]) / (mass * speed)
     travelled = speed / 0.5 * -np.diff(np.arcsinh(sizes))

@@ -1,4 +1,4 @@
-"""The hard cases, scaled down: bounds are those measured, with a little room."""
+"""The hard cases, scaled down: bounds are measured values with a small margin."""
 
 import diffrax as dfx
 import equinox as eqx
@@ -15,7 +15,7 @@ import diffrax_presym as dps
 LEAPFROG = dps.PresymplecticLeapfrog()
 RKN4 = dps.BlanesMoanRKN4()
 REST = (jnp.ones(1), jnp.zeros(1))
-# Older versions of Optimistix have no word for it.
+# Older versions of Optimistix have no such result.
 NONFINITE = getattr(dfx.RESULTS, "nonfinite", dfx.RESULTS.nonlinear_divergence)
 
 
@@ -34,7 +34,7 @@ def last(sol):
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("solver", [LEAPFROG, RKN4], ids=["leapfrog", "RKN4"])
 def test_no_overflow_of_the_frame(dtype, solver):
-    # exp(1000) overflows both precisions; the slow decay is all that is left.
+    # exp(1000) overflows in both precisions; only the slow mode remains.
     y0 = jax.tree.map(lambda x: x.astype(dtype), REST)
     t1, dt0, gamma = (jnp.asarray(x, dtype) for x in (50.0, 0.025, 20.0))
     system = damped(harmonic, dps.ConstantDamping(gamma))
@@ -52,7 +52,7 @@ def test_excitation_grows_until_overflow_is_physical():
     for t1 in (100.0, 250.0):
         t0, t1, dt0 = (jnp.float32(t) for t in (0.0, t1, 0.05))
         ends.append(solve(system, dps.Checked(LEAPFROG), t0, t1, dt0, y0, throw=False))
-    # exp(50) is a float32, and exp(125) is not.
+    # exp(50) is finite in float32, and exp(125) is not.
     assert ends[0].result == dfx.RESULTS.successful
     assert ends[1].result == NONFINITE
 
@@ -64,8 +64,8 @@ def test_leapfrog_is_stable_up_to_two(h, stable):
 
 
 def test_no_drift_in_1e5_steps():
-    # A power of two, so that no time is rounded. Bounded by the error of the scheme
-    # at first and at last; rounding is a random walk far below.
+    # The step is a power of two, so times are exact. The error is bounded by that of
+    # the scheme throughout; rounding errors are far smaller.
     system = conservative(harmonic)
     term = dps.HamiltonianTerm(system)
     saveat = dfx.SaveAt(steps=True)
@@ -78,14 +78,14 @@ def test_no_drift_in_1e5_steps():
     error = np.abs(np.asarray(energy) - 0.5)
     assert error.max() < 0.125**2 / 4
     assert error[-200:].max() < 1.01 * error[:200].max()
-    # The modified energy, which the leapfrog keeps exactly but for rounding.
+    # The modified energy, which the leapfrog preserves to rounding.
     q, p = (np.asarray(x[:2000, 0]) for x in sol.ys)
     kept = p**2 + q**2 * (1 - 0.125**2 / 4)
     assert np.abs(kept - kept[0]).max() < 1e-13
 
 
 def test_ensemble_of_chaos():
-    # Henon-Heiles at energy 1/8: two schemes, other orbits, the same mean.
+    # Henon-Heiles at energy 1/8: two schemes, different trajectories, equal means.
     key = jax.random.key(0)
     q0 = 0.1 * jax.random.normal(key, (100, 2))
     p0 = jax.random.normal(jax.random.fold_in(key, 1), (100, 2))
@@ -139,7 +139,7 @@ def test_stages_before_the_start_are_reported():
 
 
 def test_kink():
-    # Every crossing of the kink errs by h^2, to either side, and none remembers.
+    # Each crossing of the kink has an error of order h^2, of either sign.
     system = conservative(lambda t, q, args: jnp.sum(jnp.abs(q)))
     q, p = last(solve(system, LEAPFROG, 0.0, 20 * 4 * 2**0.5, 0.05, REST))
     assert abs(abs(q[0]) + p[0] ** 2 / 2 - 1) < 0.05
@@ -159,7 +159,7 @@ def test_bounces():
 
 
 def test_damping_by_pieces():
-    # Order two where a step ends at the jump of the rate; there, exact.
+    # Accurate if a step ends at the jump of the rate, and of order two otherwise.
     system = damped(harmonic, lambda t: jnp.maximum(t - 1.0, 0.0))
     y1 = np.array([np.cos(1.0), -np.sin(1.0)])
     matrix = jnp.array([[0.0, 1.0], [-1.0, -1.0]])
@@ -189,7 +189,7 @@ def test_damping_by_pieces():
     ids=["condition", "rank", "masses"],
 )
 def test_conditioning(stiffness, mass):
-    # Each direction by itself: the slow ones are as they are alone.
+    # The modes are independent: the slow ones are as accurate as alone.
     stiffness = jnp.asarray(stiffness)
     mass = None if mass is None else jnp.asarray(mass)
     potential = lambda t, q, args: jnp.sum(args * q**2) / 2
@@ -201,7 +201,7 @@ def test_conditioning(stiffness, mass):
 
 
 def broken(t, q, args):
-    """Not defined for negative positions."""
+    """Undefined for negative positions."""
     return -jnp.sum(jnp.sqrt(q))
 
 

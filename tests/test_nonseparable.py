@@ -46,14 +46,14 @@ def test_energy_errors_do_not_grow():
 def test_free_copies_are_more_accurate_at_equal_cost():
     tao = energy_errors(dps.PresymplecticTao(), 1 / 40)[1]
     assert 5 * energy_errors(dps.PresymplecticCoupled(), 1 / 40)[1] < tao
-    # With a coupling of 10, the best there is.
+    # With a coupling of 10, which is optimal.
     tao_4 = energy_errors(dps.Suzuki4(dps.PresymplecticTao(10.0)), 1 / 20)[1]
     coupled_4 = energy_errors(dps.PresymplecticCoupled(4), 1 / 20 * 11 / 15)[1]
     assert 100 * coupled_4 < tao_4
 
 
 def test_copies_that_resonate_part():
-    # The difference is turned by half a circle, and the copies are swapped at best.
+    # The difference is rotated by pi, which at best exchanges the copies.
     angles = [np.pi / 2, np.pi]
     distances = []
     for angle in angles:
@@ -106,7 +106,7 @@ def canonical_energy(t, q, P, args):
 def test_damped_motion_stays_finite_and_conformal(solver, dt0):
     sol = solve(DAMPED, solver, 0.0, 1000.0, dt0, START, max_steps=None)
     assert sol.result == dfx.RESULTS.successful
-    # Near rest it is the oscillator, and so is its decay.
+    # At small amplitude the system is the oscillator, with the same decay.
     assert np.log(np.max(np.abs(flat(sol.ys)))) == pytest.approx(-25, abs=1.5)
     n = 2
 
@@ -136,7 +136,7 @@ def test_damped_motion_stays_finite_and_conformal(solver, dt0):
 
 
 def test_a_coupling_of_canonical_momenta_fails():
-    # What the moving frame is for. A result, and not numbers.
+    # Without mechanical momenta, the solve fails with an unsuccessful result.
     sol = solve(
         *(dps.Hamiltonian(canonical_energy), dps.PresymplecticTao(5.0)),
         *(0.0, 1000.0, 1 / 16, START),
@@ -146,7 +146,7 @@ def test_a_coupling_of_canonical_momenta_fails():
     assert sol.result != dfx.RESULTS.successful
 
 
-# Structure. Where the projected scheme is not symplectic is measured; free copies are.
+# Structure. The projected scheme is not symplectic; uncoupled copies are.
 
 T0, H0 = jnp.array(0.5), 1 / 16
 WAVY = dps.ConformalHamiltonian(energy=mixed_energy, damping=dps.LogDamping(2.0))
@@ -182,7 +182,7 @@ def test_defect_of_the_projection_is_of_higher_order():
 
 
 def spin(t, q, p, args):
-    """Rotational symmetry, and not separable."""
+    """A nonseparable energy with rotational symmetry."""
     return (1 + jnp.sum(q**2)) * jnp.sum(p**2) / 2 + jnp.sum(q**2) ** 2
 
 
@@ -201,7 +201,7 @@ def test_a_midpoint_that_is_not_found_is_a_result():
     assert sol.stats["num_steps"] == 1
 
 
-# What is refused, and what fails
+# Errors and failures
 
 NOTHING: Any = None
 

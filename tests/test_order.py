@@ -1,4 +1,4 @@
-"""Every scheme converges at the order claimed, to the exact solution."""
+"""Every scheme converges to the exact solution with the claimed order."""
 
 import functools
 
@@ -27,12 +27,12 @@ from helpers import (
 import diffrax_presym as dps
 
 
-# Steps closer than by halves: a scheme of order 8 is soon down to rounding.
+# Ratios of less than two, as a scheme of order 8 soon reaches rounding errors.
 STEPS = [*range(2, 11), *(n * 2**k for k in range(6) for n in (12, 14, 16, 20))]
 
 
 def measured_order(error, plateau):
-    """The slope over the three finest steps whose error is not yet rounding."""
+    """The slope over the three smallest steps with errors above rounding."""
     steps, errors = [], []
     for n in STEPS:
         size = error(n)
@@ -44,8 +44,8 @@ def measured_order(error, plateau):
     return -np.polyfit(np.log(steps[-3:]), np.log(errors[-3:]), 1)[0]
 
 
-# The two oscillators of the paper, whose solutions are known. Errors are of the
-# canonical Hamiltonian, the largest over all steps.
+# The two oscillators of the paper, with known solutions. Errors are the largest errors
+# of the canonical Hamiltonian over all steps.
 
 
 def damped(t, gamma=0.2, q0=10):
@@ -65,7 +65,7 @@ def decaying(t, gamma=3, q0=1):
     return q0 * np.pi / 2 * q, q0 * np.pi / 2 * P
 
 
-# exact solution, eta(t), damping, q(0), error in float64 where rounding takes over
+# Exact solution, eta(t), damping, q(0), level of rounding errors in float64
 OSCILLATORS = {
     "damped": (damped, lambda t: 0.2 * t, dps.ConstantDamping(0.2), 10.0, 3e-12),
     "decaying": (
@@ -106,15 +106,15 @@ def test_yoshida_is_the_first_of_the_suzuki_yoshida_family():
 
 @few(OSCILLATORS, SCHEMES)
 def test_order_on_oscillators(scheme: Scheme, case):
-    # Eight steps are the least that resolve a period.
+    # At least eight steps per period.
     error = lambda n: oscillator_error(case, scheme, 10 / (4 * n))
     order = measured_order(error, 10 * OSCILLATORS[case][-1])
     assert abs(order - scheme.order) < 0.15
 
 
-# Oscillators super-converge, so the order is measured on systems that can fail too. The
-# truth is from SciPy, solving Hamilton's equations for the canonical momentum, with
-# every derivative by hand.
+# Oscillators may super-converge, so the order is also measured on nonlinear systems.
+# The reference is from SciPy, for Hamilton's equations in the canonical momentum, with
+# hand-written derivatives.
 
 
 def driven_potential(t, q, args):
@@ -162,7 +162,7 @@ def entangled_field(t, q, P):
     return wave * (1 + q @ q) * p, -scale * wave * (1 + p @ p) * q
 
 
-# Hamiltonian, the same by hand, eta(t)
+# Hamiltonian, hand-written derivatives, eta(t)
 SYSTEMS = {
     "damped pendulum": (
         dps.ConformalHamiltonian(
@@ -218,7 +218,7 @@ def check_order(scheme: Scheme, system):
     def error(n):
         hamiltonian = SYSTEMS[system][0]
         sol = solve(hamiltonian, scheme.solver, 0.0, T1, T1 / n, y0, throw=False)
-        # The longest steps are too long for the root finder.
+        # The root finder fails for the largest steps.
         solved = sol.result == dfx.RESULTS.successful
         return np.max(np.abs(flat(sol.ys) - truth(system))) if solved else np.inf
 

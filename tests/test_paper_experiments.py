@@ -1,4 +1,4 @@
-"""What the experiments of the paper compute, where it can be had in another way."""
+"""Results of the paper's experiments, against independent computations."""
 
 import itertools
 
@@ -19,7 +19,7 @@ from examples.paper._common import Nesterov
 
 @pytest.fixture(autouse=True)
 def as_user():
-    """The examples are written for JAX as it is imported."""
+    """The examples are written for the default settings of JAX."""
     with (
         jax.numpy_dtype_promotion("standard"),
         jax.numpy_rank_promotion("allow"),
@@ -30,7 +30,7 @@ def as_user():
 @pytest.mark.slow
 @pytest.mark.parametrize("temperature", [0.8, 2.2, 2.4, 4.0])
 def test_partition_function_by_enumeration(temperature):
-    """Both sides of the critical temperature, where a sign changes."""
+    """On both sides of the critical temperature, where a term changes its sign."""
     spins = np.array(list(itertools.product((-1, 1), repeat=16)), np.int8)
     energies = np.asarray(ising.energy(jnp.asarray(spins).reshape(-1, 4, 4)), float)
     weights = np.exp(-(energies + 32) / temperature)
@@ -58,7 +58,7 @@ def test_metropolis_draws_from_the_ensemble():
 @pytest.mark.parametrize("name", phase.METHODS)
 @pytest.mark.parametrize("gamma", [0.3, 2.0])
 def test_limits_of_stability(name, gamma):
-    """Trace and determinant are those of a step, and past the limit it grows."""
+    """Trace and determinant are those of a step, which is unstable above the limit."""
     solver, method = phase.METHODS[name]
     fastest = jnp.array([3.0])
     found = phase.largest_step(method, gamma, np.asarray(fastest))
@@ -88,7 +88,7 @@ def test_limits_of_stability(name, gamma):
 
 
 def test_nesterov_by_hand():
-    """And the heavy ball, which is Euler's method with the momentum first."""
+    """And the heavy ball method, which is Euler's method, momentum first."""
     M = np.diag([1.0, 2.0])
     gamma, h = 0.7, 0.3
     mu = np.exp(-gamma * h)
@@ -126,7 +126,7 @@ def test_nesterov_by_hand():
 
 
 def test_modes_are_the_matrix():
-    """The same gradient norms in the coordinates of the matrix and of its modes."""
+    """Gradient norms agree in the original and in the modal coordinates."""
     key = jax.random.key(3)
     eigenvalues, q0 = phase.modes(key, 16, 20)
     A = np.asarray(jax.random.normal(key, (16, 20)))
@@ -157,7 +157,7 @@ def test_machine_is_trained_by_the_scaled_leapfrog():
     mu = 0.98
     add = lambda x, c, y: jax.tree.map(lambda x, y: x + c * y, x, y)
     scale = lambda c, x: jax.tree.map(lambda x: c * x, x)
-    # `force` has the step size in it.
+    # `force` includes the step size.
     force = jax.jit(lambda step, q: scale(1 / h, machine.force(step, q, data)))
     q, p = q0, scale(0.0, q0)
     slope = force(0.0, q)
@@ -172,7 +172,7 @@ def test_machine_is_trained_by_the_scaled_leapfrog():
 
 
 def test_contrastive_divergence_follows_the_likelihood():
-    """At the model's own samples there is nothing to learn, on average."""
+    """For samples of the model itself, the mean gradient vanishes."""
     key = jax.random.key(6)
     q = jax.tree.map(lambda x: x[0], machine.initial(key, 1))
     start = jax.random.bernoulli(key, 0.5, (1000, 64)).astype(jnp.float32)

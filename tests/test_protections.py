@@ -1,4 +1,4 @@
-"""Solvers around solvers: digits that sums lose, and failures where they happen."""
+"""Wrappers: compensated summation, and detection of non-finite states."""
 
 import diffrax as dfx
 import equinox as eqx
@@ -11,7 +11,7 @@ from helpers import assert_close, henon_heiles, mixed_energy, oscillator, solve,
 import diffrax_presym as dps
 
 
-# Older versions of Optimistix have no word for it.
+# Older versions of Optimistix have no such result.
 NONFINITE = getattr(dfx.RESULTS, "nonfinite", dfx.RESULTS.nonlinear_divergence)
 BASES = [
     dps.PresymplecticLeapfrog("position"),
@@ -40,7 +40,7 @@ def test_compensated_is_the_same_scheme(base):
 
 @each_base
 def test_compensated_keeps_the_digits_of_float32(base):
-    # What is carried along is what the step in doubles has more.
+    # The compensation is the difference to a step in double precision.
     y0 = jax.tree.map(lambda x: x.astype(jnp.float32), Y0)
     t0, t1 = jnp.float32(0.0), jnp.float32(0.125)
     exact, *_ = step(HENON, base, 0.0, 0.125, jax.tree.map(np.float64, y0))
@@ -56,7 +56,7 @@ def test_compensated_keeps_the_digits_of_float32(base):
 
 
 def test_compensated_error_grows_less():
-    # 3e4 steps of 1/8, of which every time is exact; errors of eight orbits, as one.
+    # 3e4 steps of 1/8, whose times are exact; root mean square over eight orbits.
     hamiltonian = oscillator(0.0)
     q0 = jnp.linspace(0.3, 1.0, 8)
     rms = {}
@@ -90,7 +90,7 @@ def test_compensated_goes_on_from_its_state():
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_nominal_length_in_float32(sign):
-    # At t = 1e4 the difference of two times is off by a tenth; the length is not.
+    # At t = 1e4 the difference of two times is wrong by percents; the length is not.
     t0, h = jnp.float32(sign * 1e4), jnp.float32(0.01)
     t1 = t0 + sign * h
     assert abs(abs(t1 - t0) / h - 1) > 0.02
@@ -98,7 +98,7 @@ def test_nominal_length_in_float32(sign):
     free = dps.SeparableHamiltonian(dps.QuadraticKinetic(), lambda t, q, args: 0 * q)
     kept, *_ = step(free, dps.Compensated(BASES[1], h), t0, t1, y0)
     assert_close(kept[0], jnp.float32(1 + sign * 0.005), 1e-7)
-    # A step that is cut short is as short as it is.
+    # A shortened step keeps its actual length.
     kept, *_ = step(free, dps.Compensated(BASES[1], 2 * h), t0, t1, y0)
     assert_close(kept[0] - 1, (t1 - t0) / 2, 1e-7)
 
@@ -133,7 +133,7 @@ def test_compensated_gradients():
 
 
 def explodes(t, q, args):
-    """Not defined beyond `args`."""
+    """Undefined beyond `args`."""
     return -jnp.sum(jnp.sqrt(args - q))
 
 

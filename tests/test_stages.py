@@ -1,4 +1,4 @@
-"""The loop over the stages, and the numbers that are taken out of it."""
+"""The loop over the stages, and the quantities that are hoisted out of it."""
 
 import jax
 import jax.lax as lax
@@ -18,8 +18,8 @@ TIMES, LENGTHS = jnp.array([0.1, 0.2, 0.4]), jnp.array([1.0, -2.0, 3.0])
 def by(scan, rate, y, reverse=False):
     def stage(y, moves):
         t, length = moves
-        factor = jnp.exp(-rate * t)  # a number that does not need the state
-        wide = jnp.log1p(t) * jnp.linspace(0, 1, y.size)  # more than a number
+        factor = jnp.exp(-rate * t)  # a scalar that does not depend on the state
+        wide = jnp.log1p(t) * jnp.linspace(0, 1, y.size)  # not a scalar
         y = y + factor * length * jnp.sin(y) + wide
         return y, (factor, jnp.sum(y), None)
 
@@ -76,7 +76,7 @@ def test_callbacks_are_called_with_numbers():
 def end(solver, damping, n, **kwargs):
     system = dps.ConformalHamiltonian(
         dps.QuadraticKinetic(),
-        # A drive, so that the force too knows the time.
+        # A driving force, so that the force depends on time as well.
         lambda t, q, args: jnp.sum(q**2 / 2 + q**4 / 4 - jnp.cos(t) * q),
         damping,
     )

@@ -1,4 +1,4 @@
-"""Steps by the state: reversible, positive, and without drift of the energy."""
+"""State-dependent steps: reversible, positive, and without energy drift."""
 
 import dataclasses
 from typing import Any
@@ -76,7 +76,7 @@ def test_a_solve_goes_back_the_way_it_came(solver, density):
         dt0=-controller.step_size(state),
         controller_state=state,
     )
-    # Rounding may leave a last step of no length.
+    # Rounding may leave a last step of length zero.
     assert int(back.stats["num_steps"]) in (steps, steps + 1)
     ts = np.asarray(there.ts)
     assert np.ptp(np.diff(ts)) > 1e-2
@@ -85,7 +85,7 @@ def test_a_solve_goes_back_the_way_it_came(solver, density):
 
 
 class Naive(dps.StepDensityController):
-    """What one would write first: the density where the step starts."""
+    """A control that is not reversible: the density at the start of the step."""
 
     def adapt_step_size(self, t0, t1, y0, y1, args, error, order, state):
         h = self.epsilon * self.density(t1, y1, args)
@@ -93,7 +93,7 @@ class Naive(dps.StepDensityController):
 
 
 def energy_means(controller, solver, orbits, **kwargs):
-    """Of the error in the energy, over the first and over the last tenth."""
+    """Mean energy errors over the first and over the last tenth."""
     saveat = dfx.SaveAt(steps=True)
     kwargs = dict(saveat=saveat, max_steps=16384) | kwargs
     sol = solve(controller, solver, 0.0, orbits * PERIOD, Y0, **kwargs)
@@ -110,14 +110,14 @@ def test_the_energy_of_an_eccentric_orbit_does_not_drift():
         dps.StepDensityController(KEPLER, 0.1, density), leapfrog, 150
     )
     assert abs(last - first) < 0.05 * largest and largest < 0.02
-    # It is the control that does this, and not the density.
+    # The reversibility of the control is required, not only the density.
     naive: Any = Naive
     first, last, _ = energy_means(naive(KEPLER, 0.1, density), leapfrog, 150)
     assert abs(last - first) > 0.05
 
 
 def test_damping_takes_the_energy_it_should():
-    # Against tiny constant steps of an unrelated solver.
+    # Against small constant steps of an unrelated solver.
     term = kepler(1e-2)
     controller = dps.StepDensityController(term, 0.1, dps.DistanceDensity())
     sol = solve(controller, dps.BlanesMoanRKN6(), 0.0, 3 * PERIOD, Y0)
@@ -162,7 +162,7 @@ def test_backwards_in_time_is_the_same_motion():
     y1 = jax.tree.map(lambda y: y[-1], end.ys)
     start = solve(controller, dps.BlanesCasasRKN8(), 3.0, 1.0, y1)
     assert_close(jax.tree.map(lambda y: y[-1], start.ys), Y0, 1e-7)
-    # The same steps for the mirrored system.
+    # The same steps for the time-reversed system.
     mirrored = eqx.tree_at(
         lambda c: c.density, controller, lambda t, y, args: density(-t, y, args)
     )

@@ -1,4 +1,4 @@
-"""What makes the schemes presymplectic: the form contracts, and steps can be undone."""
+"""Structure: contraction of the symplectic form, and symmetry."""
 
 import dataclasses
 from collections.abc import Callable
@@ -32,7 +32,7 @@ from jax.flatten_util import ravel_pytree
 import diffrax_presym as dps
 
 
-# The schemes with two copies, which are symplectic with both.
+# The schemes with two copies, which are symplectic in the doubled phase space.
 AUGMENTED = [scheme for scheme in SCHEMES if scheme.kind in ANY]
 NAMED = {scheme.name: scheme for scheme in SCHEMES}
 
@@ -51,7 +51,7 @@ def swinging_energy(t, q, p, args):
     return (1 + jnp.sin(t) / 4) * mixed_energy(t, q, p, args)
 
 
-# damping law, and its eta(t) once more in NumPy
+# Damping law, and its eta(t) in NumPy
 DAMPINGS = {
     "mixed": (
         dps.MixedDamping(2.0, 0.5, 0.3),
@@ -61,7 +61,7 @@ DAMPINGS = {
     "constant": (dps.ConstantDamping(0.7), lambda t: 0.7 * t),
     "exciting": (dps.ConstantDamping(-0.7), lambda t: -0.7 * t),
     "logarithmic": (dps.LogDamping(3.0), lambda t: 3 * np.log(t)),
-    # Its rate changes sign inside the step taken below.
+    # Its rate changes sign within the step used below.
     "callable": (lambda t: 3 * (t - 2.05) ** 2, lambda t: 3 * (t - 2.05) ** 2),
 }
 MASS = jnp.array([[2.0, 0.3], [0.3, 1.0]])
@@ -100,7 +100,7 @@ def doubled_step(hamiltonian, solver, t0, t1, y, copy):
     y, _, _, carry, _ = solver.step(
         dps.HamiltonianTerm(hamiltonian), t0, t1, y, None, carry, False
     )
-    # What comes first is the copy, or the difference.
+    # The first leaves are the copy, or the difference.
     return y, jtu.tree_leaves(carry)[:2]
 
 
@@ -119,8 +119,8 @@ def jacobian(hamiltonian, solver, t0, t1, *state):
 
 def structure_defect(hamiltonian, scheme, contraction):
     y = (Q0, P0)
-    # Copies apart, as in the middle of a solve; or half their difference, which makes
-    # as good coordinates.
+    # Different copies, as in the middle of a solve; or half their difference, which is
+    # an equivalent coordinate.
     copy = (Q0 + 0.01, P0 - 0.02)
     state = {"augmented": (y, copy), "coupled": (y, (0.01 * Q0, -0.02 * P0))}
     state = state.get(scheme.kind, (y,))
@@ -142,7 +142,7 @@ def test_form_contracts_with_the_damping(scheme: Scheme, case):
 
 @each()
 def test_form_contracts_under_unequal_damping(scheme: Scheme):
-    # The frame is that of eta2.
+    # The log scale is eta2.
     assert structure_defect(UNEQUAL, scheme, np.exp(-0.4 * 0.1)) < 1e-13
 
 
@@ -158,19 +158,19 @@ def test_form_contracts_for_any_kinetic_energy(scheme: Scheme):
 def test_form_contracts_for_nonseparable_energies(scheme: Scheme):
     law, eta = DAMPINGS["logarithmic"]
     hamiltonian = dps.ConformalHamiltonian(energy=swinging_energy, damping=law)
-    # An implicit scheme is as symplectic as its root finder is accurate.
+    # An implicit scheme is symplectic to the tolerance of its root finder.
     tolerance = 1e-9 if scheme in IMPLICIT else 1e-13
     assert structure_defect(hamiltonian, scheme, contraction(eta)) < tolerance
 
 
 def test_a_runge_kutta_method_does_not_contract_the_form():
-    # Or the measure would be blind.
+    # The test can fail.
     law, eta = DAMPINGS["constant"]
     heun = Scheme("heun", dfx.Heun(scan_kind="bounded"), 2, 2)
     assert structure_defect(quadratic(law), heun, contraction(eta)) > 1e-6
 
 
-# Symmetry: a step by h and one by -h is no step at all.
+# Symmetry: a step of -h is the inverse of a step of h.
 
 
 @eqx.filter_jit
@@ -219,12 +219,12 @@ def test_the_two_euler_methods_undo_each_other(first, second):
     check_symmetry(hamiltonian, there, back, 2e-14)
 
 
-# The mechanical momentum is an exact change of variables: the schemes are the paper's.
+# The mechanical momentum is an exact change of variables: agreement with the paper.
 
 
 @dataclasses.dataclass
 class Canonical:
-    """Derivatives by hand of a Hamiltonian of the canonical momentum."""
+    """Hand-written derivatives of a Hamiltonian in the canonical momentum."""
 
     velocity: Callable
     slope: Callable

@@ -29,7 +29,7 @@ COMPOSITIONS = {
     "SuzukiYoshida8": dps.SuzukiYoshida(8),
 }
 SCHEMES = SPLITTINGS | COMPOSITIONS
-# The paper's own triple jumps are tested with the other schemes of the paper.
+# The triple jumps are tested with the other schemes of the paper.
 NEW = [name for name in SCHEMES if not name.startswith("SuzukiYoshida")]
 
 
@@ -67,7 +67,7 @@ def test_coefficients_are_symmetric(name):
     assert table == table[::-1]
 
 
-# Two nonlinear systems in which everything depends on time.
+# Two nonlinear systems in which all parts depend on time.
 
 
 def pendulum_on_a_moving_pivot(t, q, args):
@@ -108,7 +108,7 @@ def test_order_on_nonlinear_systems_that_depend_on_time(name, system):
     for n in steps:
         ys = flat(solve(SYSTEMS[system], solver, T0, T1, (T1 - T0) / n, Y0).ys)
         errors.append(np.max(np.abs(np.asarray(ys) - exact(system))))
-    # Off the rounding plateau. Above its claim, a scheme is not there yet, not wrong.
+    # Above rounding errors. A slope above the claimed order is pre-asymptotic.
     fine = np.flatnonzero(np.array(errors) > 1e-13)[-3:]
     slope, _ = np.polyfit(np.log(1 / steps[fine]), np.log(np.array(errors)[fine]), 1)
     assert slope > solver.order(None) - 0.15
@@ -171,7 +171,7 @@ def test_one_evaluation_of_the_force_for_each_kick(name):
         calls += 1
         return np.asarray(-q)
 
-    # Differentiated, but not evaluated, for the dense output of high order.
+    # For dense output the derivative is traced, but not evaluated.
     @jax.custom_jvp
     def force(q):
         return jax.pure_callback(count, jax.ShapeDtypeStruct(q.shape, q.dtype), q)
@@ -187,7 +187,7 @@ def test_one_evaluation_of_the_force_for_each_kick(name):
     jax.block_until_ready(sol.ys)
     tableau = SPLITTINGS[name].tableau
     kicks = len(tableau.fractions[0 if tableau.kick_first else 1 :: 2])
-    # A kick that ends one step and starts the next is evaluated once.
+    # The force of a kick that ends one step and starts the next is evaluated once.
     per_step = kicks - tableau.kick_first
     assert calls == per_step * steps + tableau.kick_first
 
@@ -216,7 +216,7 @@ def test_the_exact_drift_is_smooth_in_the_damping(gamma, law):
 
 
 def test_a_splitting_of_your_own():
-    # Strang's splitting, exact drift first: the midpoint of the harmonic oscillator.
+    # Strang splitting, drift first.
     strang = dps.SplittingTableau(
         order=2, kick_first=False, quadratic=False, fractions=(0.5, 1.0, 0.5)
     )

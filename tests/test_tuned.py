@@ -1,4 +1,4 @@
-"""What is known to be linear or quadratic, and the schemes that make use of it."""
+"""Quadratic potentials and linear forces, and the schemes that exploit them."""
 
 from fractions import Fraction
 from typing import Any
@@ -22,7 +22,7 @@ MATRIX = jnp.array([[2.0, -1.0], [-1.0, 3.0]])
 
 
 def end(*args):
-    """The state at the end of a solve."""
+    """The final state of a solve."""
     return jax.tree.map(lambda y: y[-1], solve(*args).ys)
 
 
@@ -58,7 +58,7 @@ each_law = pytest.mark.parametrize(
 )
 
 
-# The forms of a stiffness.
+# Forms of the stiffness.
 
 
 def diagonal(q):
@@ -116,7 +116,7 @@ def test_stiffnesses_that_do_not_fit(stiffness, message):
 def test_the_response_to_a_force(gamma, law):
     t, h = jnp.array(2.0), jnp.array(0.3)
     damping = law(gamma)
-    # That of the base class is a quadrature.
+    # The base class uses quadrature.
     expected = dps.AbstractDamping.response(damping, t, h, 16)
     assert abs(damping.response(t, h, 4) - expected) < 2e-16 * 4
     slope = jax.grad(lambda gamma: law(gamma).response(t, h, 4))(gamma)
@@ -126,12 +126,12 @@ def test_the_response_to_a_force(gamma, law):
 
 
 def test_the_response_from_the_start_of_friction_that_is_infinite_there():
-    # The momentum is h / (1 + gamma) when a constant force has acted for h.
+    # The momentum gained under a unit force over h is h / (1 + gamma).
     damping, h = dps.LogDamping(3.0), jnp.array(0.5)
     assert_close(damping.response(jnp.array(0.0), h, 4), h / 4, 1e-15)
 
 
-# Positions and momenta in each other's roles.
+# Exchanged roles of positions and momenta.
 
 
 def quartic(t, p, args):
@@ -188,7 +188,7 @@ LINEAR = dps.TunedLinear8()
 
 
 def _series(fractions, kick_first, degree):
-    """A step of an oscillator as polynomials in step times frequency, exactly."""
+    """A step of an oscillator as exact polynomials in step size times frequency."""
     one, zero = [Fraction(1)], [Fraction(0)]
     rows = [[one, zero], [zero, one]]
     for i, fraction in enumerate(fractions):
@@ -221,7 +221,7 @@ def test_a_step_of_an_oscillator_is_its_rotation_to_eighth_order():
 
 @pytest.mark.parametrize("gamma", [0.0, 0.5, 5.0, -0.1])
 def test_long_steps_of_a_linear_system(gamma):
-    # Frequencies up to where the error of a step was claimed to be 1e-9.
+    # Frequencies up to the claimed limit for an error of 1e-9 per step.
     omega = jnp.linspace(0.1, 3.6, 50)
     damping = dps.ConstantDamping(gamma)
     system = dps.ConformalHamiltonian(

@@ -1,4 +1,4 @@
-"""`vmap` over everything, equal to a loop."""
+"""`vmap` over all arguments agrees with a loop."""
 
 import diffrax as dfx
 import equinox as eqx
@@ -47,7 +47,7 @@ ARGUMENTS = {
 SPLITTING = Scheme("splitting", dps.BlanesMoanRKN6(), 6, 14, kind="quadratic")
 
 
-# Compiled for a batch and alone, so two stand for all.
+# Two schemes only, as each is compiled twice.
 FEW = {"leapfrog_AB", "coupled_4"}
 
 
@@ -59,7 +59,7 @@ def element(batch, i):
 def test_everything_at_once(scheme: Scheme):
     scales = jnp.array([0.8, 1.0, 1.25])
     batch = {name: jnp.tensordot(scales, x, 0) for name, x in ARGUMENTS.items()}
-    # Forwards, not at all, and backwards.
+    # Forwards, an empty interval, and backwards.
     batch["t1"] = batch["t0"] + jnp.array([1.0, 0.0, -1.5])
     batch["dt0"] = jnp.array([0.1, 0.1, -0.125])
     together = jax.vmap(lambda arguments: solve(scheme.solver, **arguments))(batch)

@@ -1,4 +1,4 @@
-"""What the experiments share: options, pictures, tables, and Nesterov's method."""
+"""Shared code of the experiments: options, figures, tables, Nesterov's method."""
 
 import argparse
 import pathlib
@@ -24,21 +24,21 @@ def parser(description) -> argparse.ArgumentParser:
     parser.add_argument(
         "--docs",
         action="store_true",
-        help="put picture and table into docs/, not the picture into this directory",
+        help="save figure and table in docs/, instead of the figure in this directory",
     )
     return parser
 
 
 def report(name, fig, rows, options) -> None:
-    """Save the picture; print the table, and put it into docs/reproduction.md.
+    """Save the figure; print the table, and insert it into docs/reproduction.md.
 
-    Each row says what it is about, what the paper says of it, and what was measured.
+    Each row consists of a topic, the statement of the paper, and the measurement.
     """
     path = (DOCS / "img" if options.docs else pathlib.Path()) / f"paper_{name}.png"
     fig.savefig(path, dpi=100)
-    # A palette is enough for lines, and takes a third of the space.
+    # A palette is sufficient for line plots, and takes a third of the space.
     Image.open(path).quantize(256).save(path, optimize=True)
-    print(f"\nPicture saved to {path}\n")
+    print(f"\nFigure saved to {path}\n")
     for what, paper, measured in rows:
         print(f"{what}\n    paper says  {paper}\n    we measure  {measured}")
     if options.docs:
@@ -50,15 +50,15 @@ def report(name, fig, rows, options) -> None:
         text, found = pattern.subn(
             lambda _: "\n".join(["", *lines, "", ""]), page.read_text()
         )
-        assert found == 1, f"{page} has no place for the table of {name}"
+        assert found == 1, f"{page} has no markers for the table of {name}"
         page.write_text(text)
 
 
 class Nesterov(dps.AbstractPresymplecticSolver[None]):
-    """Nesterov's method as a solver of first order, with mu = exp(eta(t) - eta(t + h)).
+    """Nesterov's method as a solver of order one, with mu = exp(eta(t) - eta(t + h)).
 
-    It differs from position-first Euler in one thing: once the momentum is kicked, the
-    drift is taken again. That costs it the presymplectic structure.
+    It differs from position-first Euler in one respect: after the kick, the drift is
+    repeated with the new momentum. So it is not presymplectic.
     """
 
     @property
@@ -68,21 +68,21 @@ class Nesterov(dps.AbstractPresymplecticSolver[None]):
     def order(self, terms):
         return 1
 
-    def start(self, view, t, y):
+    def start(self, system, t, y):
         return None
 
-    def advance(self, view, t0, t1, h, y, carry):
+    def advance(self, system, t0, t1, h, y, carry):
         q, p = y
         h = h.astype(q.dtype)
-        p = view.move_frame(t0, h, p)
-        ahead = q + h * view.velocity(t1, (q, p))
-        p = p + h * view.force(t1, (ahead, p))
-        return (q + h * view.velocity(t1, (q, p)), p), None, None
+        p = system.move_frame(t0, h, p)
+        ahead = q + h * system.velocity(t1, (q, p))
+        p = p + h * system.force(t1, (ahead, p))
+        return (q + h * system.velocity(t1, (q, p)), p), None, None
 
-    def slope(self, view, t, y, carry):
-        return view.slope(t, y)
+    def slope(self, system, t, y, carry):
+        return system.slope(t, y)
 
 
 def growth(ts, errors, first, last) -> float:
-    """How much larger the largest error up to `last` is than that up to `first`."""
+    """The ratio of the largest error up to `last` to that up to `first`."""
     return float(jnp.max(errors[ts <= last]) / jnp.max(errors[ts <= first]))

@@ -1,4 +1,4 @@
-"""The two-dimensional Ising model on a periodic square: exact, and by Monte Carlo."""
+"""The two-dimensional periodic Ising model: exact, and by Monte Carlo."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ def log_partition(beta, size):
         angle = jnp.pi * number / size
         return jnp.arccosh(jnp.cosh(2 * beta) / jnp.tanh(2 * beta) - jnp.cos(angle))
 
-    # The first of the even ones changes its sign at the critical temperature.
+    # The first of the even terms changes its sign at the critical temperature.
     first = 2 * beta + jnp.log(jnp.tanh(beta))
     odd = gamma(jnp.arange(1, 2 * size, 2)) * size / 2
     even = jnp.append(gamma(jnp.arange(2, 2 * size, 2)), first) * size / 2
@@ -36,7 +36,7 @@ def exact(temperature, size):
 
 
 def energy(spins):
-    """The energy of each lattice, the last two axes of the array."""
+    """The energy of each lattice; the lattices are the last two axes of the array."""
     spins = spins.astype(jnp.float32)
     neighbours = jnp.roll(spins, 1, axis=-1) + jnp.roll(spins, 1, axis=-2)
     return -jnp.sum(spins * neighbours, axis=(-1, -2))
@@ -49,9 +49,9 @@ def estimates(energies, temperature, size):
 
 
 def sweep(key, spins, temperature):
-    """One Metropolis sweep: a proposal for every spin, first the black then the white.
+    """One Metropolis sweep, on a checkerboard: first the black spins, then the white.
 
-    Neighbours are of different colours, so all of one colour move at once.
+    Neighbours have different colours, so all spins of one colour are updated at once.
     """
     uniform = jax.random.uniform(key, spins.shape, spins.dtype)
     black = jnp.indices(spins.shape[-2:]).sum(axis=0) % 2 == 0
@@ -64,17 +64,17 @@ def sweep(key, spins, temperature):
 
 @jax.jit(static_argnames="sweeps")
 def run(key, spins, temperatures, sweeps):
-    """So many sweeps of lattices of shape (temperature, chain, size, size)."""
+    """Apply `sweeps` sweeps to lattices of shape (temperature, chain, size, size)."""
     temperatures = temperatures.astype(spins.dtype)[:, None, None, None]
     body = lambda i, s: sweep(jax.random.fold_in(key, i), s, temperatures)
     return jax.lax.fori_loop(0, sweeps, body, spins)
 
 
 def metropolis(key, temperatures, size, chains, samples, burn_in=512, thin=10):
-    """Lattices drawn at each temperature, of shape (temperature, many, size, size).
+    """Samples at each temperature, of shape (temperature, sample, size, size).
 
-    Half of the chains start with all spins up, half with all down: cold lattices do not
-    turn over in any affordable time, and random ones freeze into stripes.
+    Half of the chains start with all spins up, half with all down: at low temperatures
+    the magnetisation rarely changes sign, and random lattices freeze into stripes.
     """
     up = jnp.where(jnp.arange(chains) % 2 == 0, 1.0, -1.0).astype(jnp.float32)
     shape = (len(temperatures), chains, size, size)

@@ -1,8 +1,9 @@
-"""The Ising model, learnt by restricted Boltzmann machines.
+"""Restricted Boltzmann machines that learn the Ising model.
 
-Gradients by contrastive divergence are random: a force keyed by the step. Gradient
-descent is Euler's method, the presymplectic optimisers are the solvers they are, and
-`diffeqsolve` takes one gradient per step of each. All temperatures at once.
+Gradients by contrastive divergence are stochastic: a force whose random key depends on
+the step. Gradient descent is Euler's method, and the presymplectic optimisers are
+solvers of this package. Each evaluates one gradient per step. All temperatures are
+batched.
 """
 
 import diffrax as dfx
@@ -18,14 +19,14 @@ from examples.paper._common import parser, report
 
 
 SIZE, HIDDEN, BATCH = 8, 400, 100
-SHOWN = 14  # of the 25 temperatures, that at which the paper shows the loss: T = 2.83
+SHOWN = 14  # index of the temperature at which the paper shows the loss: T = 2.83
 
 
 class Data(eqx.Module):
     """Spins 0 and 1, of shape (temperature, batch, sample, spin); and the step size.
 
-    Time is counted in steps, which single precision adds up without error. So `h` is a
-    factor of velocity and force.
+    Time is measured in steps, which are added without rounding in single precision. So
+    `h` is a factor of velocity and force.
     """
 
     batches: jax.Array
@@ -34,7 +35,7 @@ class Data(eqx.Module):
 
 
 def initial(key, temperatures):
-    """Machines as in the authors' script: one for each temperature."""
+    """Initial parameters as in the authors' script, for each temperature."""
     keys = jax.random.split(key, 3)
     normal = lambda key, *shape: jax.random.normal(
         key, (temperatures, *shape), jnp.float32
@@ -59,7 +60,7 @@ def draw(uniform, probability):
 
 
 def gibbs(q, visible, uniform):
-    """From visible to hidden and back; `uniform` holds a number for each spin."""
+    """One Gibbs step; `uniform` contains one random number for each spin."""
     hidden = draw(uniform[:, SIZE**2 :], to_hidden(q, visible))
     return draw(uniform[:, : SIZE**2], to_visible(q, hidden))
 
@@ -80,7 +81,7 @@ def ascent(q, visible, uniform):
 
 
 def force(t, q, data):
-    step = jnp.floor(t).astype(int)  # at its start or its middle
+    step = jnp.floor(t).astype(int)  # from its start or its middle
     batch = data.batches[:, step % data.batches.shape[1]]
     uniform = uniforms(jax.random.fold_in(data.key, step), batch)
     return jax.tree.map(lambda x: data.h * x, jax.vmap(ascent)(q, batch, uniform))
@@ -91,7 +92,7 @@ def classical(t, p, data):
 
 
 def relativistic(t, p, data):
-    """Equation (rel_ham), c = 5 and m = 1; weights and biases are a particle each."""
+    """Equation (rel_ham), c = 5 and m = 1, for weights and biases separately."""
     c = 5.0
 
     def velocity(p):
@@ -102,7 +103,7 @@ def relativistic(t, p, data):
 
 
 def loss(t, q, data):
-    """Mean squared difference of a batch and its reconstruction, as in the script."""
+    """Mean squared reconstruction error of a batch, as in the authors' script."""
     batch = data.batches[:, 0]
     uniform = uniforms(jax.random.fold_in(data.key, t.astype(int)), batch)
     again = jax.vmap(gibbs)(q, batch, uniform)
@@ -110,7 +111,7 @@ def loss(t, q, data):
 
 
 def presymplectic(velocity, mu):
-    damping = dps.ConstantDamping(-2 * np.log(mu))  # mu is that of half a step
+    damping = dps.ConstantDamping(-2 * np.log(mu))  # mu is the factor of half a step
     return dps.HamiltonianTerm(dps.VectorField(velocity, force, damping))
 
 
@@ -131,7 +132,7 @@ METHODS = {
 
 @eqx.filter_jit
 def train(term, solver, q0, data, epochs, every):
-    """Losses, `every` so many epochs, and the trained machines."""
+    """The losses after each `every` epochs, and the trained machines."""
     y0 = q0
     if isinstance(term, dps.HamiltonianTerm):
         y0 = (q0, jax.tree.map(jnp.zeros_like, q0))
@@ -165,7 +166,7 @@ def train(term, solver, q0, data, epochs, every):
 
 @eqx.filter_jit
 def model_energies(key, q, visible, steps):
-    """Energies of samples of a machine: of the second half of `steps` of a chain."""
+    """Energies of samples of a machine, from the second half of a Markov chain."""
 
     def step(visible, key):
         visible = jax.vmap(gibbs)(q, visible, uniforms(key, visible))
@@ -177,7 +178,7 @@ def model_energies(key, q, visible, steps):
 
 @eqx.filter_jit
 def reconstructed_energies(key, q, visible):
-    """Energies as in the script: the data, to the hidden spins and back, rounded."""
+    """Energies as in the authors' script: of rounded reconstructions of the data."""
     uniform = uniforms(key, visible).at[..., : SIZE**2].set(0.5)
     return lattice_energy(jax.vmap(gibbs)(q, visible, uniform))
 
@@ -203,7 +204,7 @@ def main():
     options = arguments.parse_args()
     quick = options.quick
     stride = 8 if quick else options.every
-    # The paper's, such that the one whose loss it shows is always among them.
+    # Those of the paper, always including the one whose loss it shows.
     temperatures = jnp.linspace(0.5, 4.5, 25)[SHOWN % stride :: stride]
     chains, samples, burn_in = (50, 20, 100) if quick else (500, 200, 512)
     training, epochs, every = (200, 40, 10) if quick else (2000, 2000, 10)
@@ -226,7 +227,7 @@ def main():
     q0 = initial(keys[2], len(temperatures))
     losses = {}
     for name, (term, solver, h) in METHODS.items():
-        # The relativistic one the paper shows at one temperature only.
+        # The paper shows the relativistic method at one temperature only.
         those = slice(shown, shown + 1) if name.startswith("rel") else slice(None)
         print(f"{name}, {len(temperatures[those])} temperatures")
         data = Data(batches[those], keys[3], h)
@@ -243,18 +244,18 @@ def main():
     rows = [
         ("critical temperature", "2.27", f"{ising.CRITICAL_TEMPERATURE:.4f}"),
         (
-            "what was run",
-            "25 temperatures, 1e5 lattices each, 2000 of them to train on, 2000 "
+            "setup",
+            "25 temperatures, 1e5 lattices each, 2000 of them for training, 2000 "
             "iterations",
             f"{len(temperatures)} temperatures, {spins.shape[1]} lattices each, "
-            f"{training} of them to train on, {epochs} iterations of "
+            f"{training} of them for training, {epochs} iterations of "
             f"{training // BATCH} steps",
         ),
     ]
     for name, curve in losses.items():
         says = "the slowest" if name == "gradient descent" else "faster"
         says = "the fastest" if name.startswith("rel") else says
-        # Not the last value alone, which is as noisy as one batch is.
+        # An average, as single values are noisy.
         final = curve[-max(1, len(curve) // 10) :].mean()
         best = losses["gradient descent"][-max(1, len(curve) // 10) :].mean()
         rows.append(
@@ -262,7 +263,8 @@ def main():
                 f"{name}: loss at T = {temperatures[shown]:.2f}",
                 says,
                 f"{curve[0]:.3f} after {every} iterations, {final:.3f} at the end; "
-                f"the last of gradient descent {reached(curve, best, every)}",
+                "reaches the final loss of gradient descent "
+                f"{reached(curve, best, every)}",
             )
         )
     for name, (energies, heat_capacities) in observed.items():

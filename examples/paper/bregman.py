@@ -1,4 +1,4 @@
-"""Rates of Bregman dynamics, separable and not, and how far a fixed step gets."""
+"""Rates of Bregman dynamics, and the stability limit of a fixed step size."""
 
 import diffrax as dfx
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ import diffrax_presym as dps
 from examples.paper._common import parser, report
 
 
-# Convex and barely so: eigenvalues down to almost nothing, as rates assume no more.
+# Convex with tiny eigenvalues, as the rates do not assume strong convexity.
 EIGENVALUES = jnp.logspace(-5, 0, 60)
 POINT = jnp.linspace(1, 10, 10) / 55.0
 
@@ -19,7 +19,7 @@ def quadratic(t, q, args):
 
 
 def divergence(t, q, args):
-    """Kullback and Leibler's, from a point of the simplex; its minimum is 0."""
+    """Kullback-Leibler divergence from a point of the simplex; its minimum is 0."""
     return jnp.sum(q * jnp.log(q / POINT))
 
 
@@ -43,14 +43,14 @@ def values(mirror_map, objective, scaling, solver, q0, t1, h):
 
 
 def exponent(ts, fs):
-    """The power of time by which the upper envelope of f - f* decays, from t = 3 on."""
+    """The exponent of time in the decay of the envelope of f - f*, from t = 3 on."""
     envelope = np.maximum.accumulate(fs[::-1])[::-1]
     late = ts > 3
     return np.polyfit(np.log(ts[late]), np.log(envelope[late]), 1)[0]
 
 
 def blow_up(ts, fs):
-    """When f exceeds what it was at the start."""
+    """The time at which f exceeds ten times its initial value."""
     above = np.flatnonzero(fs > 10 * fs[0])
     return ts[above[0]] if len(above) else np.inf
 
@@ -93,7 +93,7 @@ def main():
                 )
             rows.append(
                 (
-                    f"{case}, c = 2, {name}: f - f* decays like t to the power",
+                    f"{case}, c = 2, {name}: exponent of the decay of f - f*",
                     "-2, the rate of the motion",
                     found,
                 )
@@ -106,8 +106,8 @@ def main():
         )
         ax.legend(fontsize=8)
 
-    # A leapfrog is stable up to the frequency 2 / h. That of the fastest mode, whose
-    # eigenvalue is one, is exp(alpha + beta / 2).
+    # The leapfrog is stable up to the frequency 2 / h. The fastest mode, whose
+    # eigenvalue is one, has the frequency exp(alpha + beta / 2).
     h = 0.05
     fastest = {
         "t^-3": (dps.PolynomialScaling(3.0), lambda t: 3 * np.sqrt(t)),
@@ -126,8 +126,8 @@ def main():
             (
                 f"separable, leapfrog: rate {rate}",
                 "preserved",
-                f"until the step is too long, at t = {limit:.1f} by theory; "
-                f"f is ten times that of the start at t = {blow_up(ts, fs):.1f}",
+                f"until the stability limit, at t = {limit:.1f} in theory; "
+                f"f is ten times its initial value at t = {blow_up(ts, fs):.1f}",
             )
         )
     axes[2].set(

@@ -25,7 +25,7 @@ def error_over_time(hamiltonian, exact, q0, solver, steps):
 
 
 def envelope(x, n):
-    """The largest of every `n`, so that a curve shows and not its oscillation."""
+    """Maxima over windows of `n` values, to remove oscillations from a plot."""
     return np.asarray(x)[: len(x) // n * n].reshape(-1, n).max(axis=1)
 
 
@@ -39,7 +39,7 @@ def main():
         axes, SYSTEMS.items(), strict=True
     ):
         error = hamiltonian_error(hamiltonian, exact, q0, round(10 / hs[-1]))
-        start = q0**2 / 2  # the value of the Hamiltonian at the start
+        start = q0**2 / 2  # the initial value of the Hamiltonian
         for color, (scheme, solver_cls) in enumerate(SCHEMES.items()):
             for first, style in (("momentum", "-"), ("position", "--")):
                 solver = solver_cls(first)

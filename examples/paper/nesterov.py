@@ -1,4 +1,4 @@
-"""Nesterov's method lets the error in the Hamiltonian grow."""
+"""Growth of the error in the Hamiltonian with Nesterov's method."""
 
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -18,7 +18,7 @@ METHODS = {
 
 
 def error_over_time(gamma, solver, steps):
-    """The error in H of the damped oscillator of the paper, against order eight."""
+    """The error in H of the paper's damped oscillator, against order eight."""
     hamiltonian = system(harmonic, dps.ConstantDamping(gamma))
     ts, _, H = solve(hamiltonian, solver, 10.0, 50.0, steps)
     _, _, exact = solve(hamiltonian, HIGH, 10.0, 50.0, steps)

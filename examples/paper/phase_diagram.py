@@ -1,7 +1,7 @@
-"""Which friction and step size a random quadratic function is minimised with.
+"""Convergence on a random quadratic function, over friction and step size.
 
-One solve for each point of the (gamma, h) plane, all of them at once by `vmap`; the
-limits of stability from theory on top.
+One solve for each point of the (gamma, h) plane, batched by `vmap`, and the theoretical
+stability limits.
 """
 
 import diffrax as dfx
@@ -15,8 +15,8 @@ import diffrax_presym as dps
 from examples.paper._common import Nesterov, parser, report
 
 
-# The map of one step for one mode, q'' = -lambda q - gamma q', by its trace and
-# determinant. `s` is h^2 lambda.
+# Trace and determinant of the map of one step, for one mode,
+# q'' = -lambda q - gamma q'. `s` is h^2 lambda.
 
 
 def euler_momentum(gamma, h, s):
@@ -40,10 +40,10 @@ def nesterov(gamma, h, s):
 
 
 def yoshida(gamma, h, s):
-    """The product of three leapfrogs, in units in which lambda is one."""
+    """The product of three leapfrog steps, in units in which lambda is one."""
     kappa = 2 ** (1 / 3)
     taus = np.array([1, -kappa, 1]) / (2 - kappa)
-    # Modes differ in gamma / sqrt(lambda) and h sqrt(lambda) alone.
+    # A mode depends only on gamma / sqrt(lambda) and h sqrt(lambda).
     steps = np.sqrt(s)
     product = np.eye(2)
     for tau in taus:
@@ -69,21 +69,21 @@ METHODS = {
 }
 
 
-# What the paper says of its two panels.
+# The statements of the paper on its two panels.
 AREA = {"leapfrog": "the wider area", "Nesterov": "the narrower area"}
-AT_ZERO = {"Nesterov": "converges for some h, by damping of its own"}
-LIMIT = {"leapfrog": "no number", "Nesterov": "does not depend on gamma (its figure)"}
+AT_ZERO = {"Nesterov": "converges for some h, by numerical damping"}
+LIMIT = {"leapfrog": "no value", "Nesterov": "does not depend on gamma (its figure)"}
 
 
 def excess(method, gamma, h, eigenvalues):
-    """How far outside Jury's conditions the worst mode is; stable where negative."""
+    """The largest violation of Jury's conditions; negative if stable."""
     gamma, h = np.asarray(gamma)[..., None], np.asarray(h)[..., None]
     trace, det = method(gamma, h, h**2 * eigenvalues)
     return np.max(np.maximum(np.abs(trace) - 1 - det, np.abs(det) - 1), axis=-1)
 
 
 def largest_step(method, gamma, eigenvalues):
-    """The largest step size below which every one is stable, to four digits."""
+    """The largest step size up to which all are stable, to four digits."""
     hs = np.arange(1, 20001) * 1e-4
     unstable = excess(method, gamma, hs, eigenvalues) > 1e-9
     return hs[np.argmax(unstable)] if unstable.any() else np.inf
@@ -92,8 +92,8 @@ def largest_step(method, gamma, eigenvalues):
 def modes(key, rows, n):
     """Eigenvalues of M = A^T A / n, and q0 = (1, ..., 1) among its eigenvectors.
 
-    The methods do not care which orthogonal coordinates they work in, and neither does
-    the norm of the gradient. In these a gradient is `n` multiplications, not `n^2`.
+    The methods and the norm of the gradient do not depend on the choice of orthogonal
+    coordinates. In these, a gradient takes `n` multiplications, not `n^2`.
     """
     A = jax.random.normal(key, (rows, n))
     eigenvalues, vectors = jnp.linalg.eigh(A.T @ A / n)
@@ -114,7 +114,7 @@ def converged(t, y, args, **kwargs):
 
 @eqx.filter_jit
 def final_gradients(solver, gammas, hs, eigenvalues, q0, iterations=800):
-    """The norm of the gradient in the end, for each gamma (rows) and h (columns)."""
+    """The final norm of the gradient, for each gamma (rows) and h (columns)."""
 
     def final_gradient(gamma, h):
         hamiltonian = dps.ConformalHamiltonian(
@@ -150,7 +150,7 @@ def main():
         2, 3, figsize=(11, 6.5), sharex=True, sharey=True, layout="constrained"
     )
     fine = np.meshgrid(np.linspace(0, 5, 101), np.linspace(0.01, 1.1, 201))
-    # The extreme modes and some between: it is the fastest that matters, mostly.
+    # A subset of the modes, including the extreme ones, which determine stability.
     some = spectrum[np.linspace(0, n - 1, 50).astype(int)]
     rows, image = [], None
     for ax, (name, (solver, method)) in zip(axes.flat, METHODS.items(), strict=False):
@@ -173,10 +173,10 @@ def main():
         ]
         rows += [
             (
-                f"{name}: where it converges",
+                f"{name}: region of convergence",
                 AREA.get(name, "not shown"),
-                f"{done.mean():.0%} of the diagram; outside the limit from theory "
-                f"{(done & ~stable).sum()} points of it",
+                f"{done.mean():.0%} of the diagram; {(done & ~stable).sum()} points "
+                "outside the theoretical limit",
             ),
             (
                 f"{name}: at gamma = 0",

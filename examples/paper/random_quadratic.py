@@ -25,7 +25,7 @@ METHODS = {
     "leapfrog": (dps.PresymplecticLeapfrog(), leapfrog, 0.9),
     "Nesterov": (Nesterov(), nesterov, 0.5),
 }
-# The text has A of 0.8 n rows, the authors' published script of n / 0.8.
+# A has 0.8 n rows in the text, and n / 0.8 in the authors' published script.
 SHAPES = {"n / 0.8 rows (script)": 1 / 0.8, "0.8 n rows (text)": 0.8}
 
 
@@ -71,7 +71,7 @@ def main():
             mean, std = curves.mean(axis=0), curves.std(axis=0)
             steps = np.arange(1, iterations + 1)
             ax.semilogy(steps, mean, label=f"{name}, h = {h}")
-            # Where the spread exceeds the mean a logarithm shows no lower end.
+            # The lower bound must be positive on a logarithmic scale.
             low = np.maximum(mean - std, mean / 10)
             ax.fill_between(steps, low, mean + std, alpha=0.3)
             reached = np.argmax(mean < 1e-3) + 1 if (mean < 1e-3).any() else None

@@ -1,4 +1,4 @@
-"""What is left of the continuous rate of convergence, and where bounds in time fail."""
+"""Preservation of the continuous rate of convergence, and bounds in time."""
 
 import diffrax as dfx
 import jax
@@ -31,15 +31,15 @@ METHODS = {
     "explicit Euler": dfx.Euler(),
     "Heun": dfx.Heun(),
 }
-# What the paper says of their rates of decay.
+# The statements of the paper on the rates of decay.
 KEPT = {name: "the continuous one" for name in ("exact (order 8)", "leapfrog", "Euler")}
 LEAPFROG = dps.PresymplecticLeapfrog()
 
 
 def scaled_error(hamiltonian, solver, h, t1):
-    """|f(q_l) - f(q(t_l))| exp(eta_2), which the theorem has of the size of h^r."""
+    """|f(q_l) - f(q(t_l))| exp(eta_2), which by the theorem is of order h^r."""
     steps = round(t1 / h)
-    # The exact solution by a scheme of order eight, at every step of the other.
+    # The exact solution, by a scheme of order eight, at the same times.
     parts = max(1, round(h / 0.05))
     _, (exact, _), _ = solve(hamiltonian, HIGH, 1.0, t1, steps * parts)
     ts, (q, _), _ = solve(hamiltonian, solver, 1.0, t1, steps)
@@ -74,7 +74,7 @@ def main():
     for system_name, hamiltonian in SYSTEMS.items():
         for name, solver in SCHEMES.items():
             runs = [scaled_error(hamiltonian, solver, h, 10.0) for h in hs]
-            # In units of its bound by f itself, so that all are far below one.
+            # Relative to the bound by f itself, so that all are far below one.
             unit = 0.5 * np.exp(hamiltonian.log_scale(jnp.array(10.0)))
             sizes = [largest(*run, 0, 10) / unit for run in runs]
             rows.append(
