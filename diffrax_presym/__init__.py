@@ -4,6 +4,7 @@ from . import diagnostics as diagnostics
 from ._adjoint import ReversibleAdjoint as ReversibleAdjoint
 from ._friction import (
     AbstractDamping as AbstractDamping,
+    AbstractFriction as AbstractFriction,
     ConstantDamping as ConstantDamping,
     LogDamping as LogDamping,
     MixedDamping as MixedDamping,

@@ -1,6 +1,7 @@
 """Arrays that Python functions hold, as leaves of a pytree."""
 
 import functools
+import inspect
 from types import CellType, FunctionType, MethodType, ModuleType
 from typing import Any
 
@@ -69,8 +70,8 @@ _PLAIN = (type, ModuleType, str, bytes, int, float, complex)
 
 
 def _convert(x, within: tuple):
-    if isinstance(x, _JITTED):
-        x = x.__wrapped__  # within a solve it is compiled anyway
+    # Within a solve it is compiled anyway.
+    x = inspect.unwrap(x, stop=lambda x: not isinstance(x, _JITTED))
     # What holds itself is not taken apart: there is no end to it.
     if any(x is y for y in within):
         return x

@@ -1,4 +1,4 @@
-from typing import TYPE_CHECKING
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -7,13 +7,6 @@ import jax.tree_util as jtu
 import optimistix as optx
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Inexact, PyTree
-
-
-if TYPE_CHECKING:
-    # To a type checker an abstract field is any kind of field.
-    from typing import ClassVar as AbstractVar
-else:
-    from equinox import AbstractVar as AbstractVar
 
 
 def as_parameter(x, name: str) -> Inexact[Array, "..."]:
@@ -71,10 +64,11 @@ class Sum(eqx.Module):
         return (self.value - other.value) + (self.lost - other.lost)
 
 
+_T = TypeVar("_T")
 _is_sum = lambda x: isinstance(x, Sum)
 
 
-def values(x: PyTree) -> PyTree:
+def values(x: _T) -> _T:
     """The numbers of a state, without what compensated summation holds besides."""
     return jtu.tree_map(lambda x: x.value if _is_sum(x) else x, x, is_leaf=_is_sum)
 

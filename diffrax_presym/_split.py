@@ -21,13 +21,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Inexact, PyTree
 
 from ._friction._base import Time
-from ._friction._damping import ScaledDamping
-from ._misc import AbstractVar
+from ._friction._damping import AbstractDamping, ScaledDamping
 
 
 if TYPE_CHECKING:
+    # To a type checker an abstract field is any kind of field.
+    from typing import ClassVar as AbstractVar
+
     from ._hamiltonian import QuadraticKinetic
     from ._system import System
+else:
+    from equinox import AbstractVar
 
 
 State: TypeAlias = tuple[PyTree[Inexact[Array, "..."]], PyTree[Inexact[Array, "..."]]]
@@ -120,22 +124,24 @@ class SharedSplit(AbstractSplit):
     """
 
     kinetic: "QuadraticKinetic"
+    half: ScaledDamping | None
+
+    def __init__(self, kinetic: "QuadraticKinetic", damping: AbstractDamping | None):
+        self.kinetic = kinetic
+        self.half = None if damping is None else ScaledDamping(damping, 0.5)
 
     @property
     def kinds(self) -> frozenset[str]:
         return frozenset({"shared"})
 
-    def _half(self, system: "System") -> ScaledDamping | None:
-        return None if system.friction is None else ScaledDamping(system.friction, 0.5)
-
     def _momentum(self, system: "System", q: PyTree) -> PyTree:
         return self.kinetic.momentum(system.values(q))
 
     def _shift(self, system: "System", t: Time, y: State, sign: int) -> State:
-        (q, p), half = y, self._half(system)
-        if half is None:
+        if self.half is None:
             return y
-        return q, system.add(p, sign * half.rate(t), self._momentum(system, q))
+        q, p = y
+        return q, system.add(p, sign * self.half.rate(t), self._momentum(system, q))
 
     def to_split(self, system: "System", t: Time, y: State) -> State:
         return self._shift(system, t, y, 1)
@@ -144,15 +150,15 @@ class SharedSplit(AbstractSplit):
         return self._shift(system, t, z, -1)
 
     def drift(self, system: "System", t: Time, h: Time, z: State, order: int) -> State:
-        (q, p), half = z, self._half(system)
+        q, p = z
         z = system.add(q, h, system.velocity(t, z)), p
-        if half is None:
+        if self.half is None:
             return z
-        return system.add(z, 1, half.decay(t, h, system.values(z)))
+        return system.add(z, 1, self.half.decay(t, h, system.values(z)))
 
     def force(self, system: "System", t: Time, z: State) -> PyTree:
-        force, half = system.potential_force(t, z), self._half(system)
-        if half is None:
+        force = system.potential_force(t, z)
+        if self.half is None:
             return force
-        rate, change = jax.jvp(half.rate, (t,), (jnp.ones_like(t),))
+        rate, change = jax.jvp(self.half.rate, (t,), (jnp.ones_like(t),))
         return system.add(force, rate**2 + change, self._momentum(system, z[0]))

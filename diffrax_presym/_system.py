@@ -1,6 +1,6 @@
 """What a solver sees of a term."""
 
-from typing import Any
+from typing import Any, TypeVar
 
 import diffrax as dfx
 import equinox as eqx
@@ -16,6 +16,7 @@ from ._misc import cast_to, describe, tree_add, tree_sub, values
 from ._split import AbstractSplit, State
 
 
+_T = TypeVar("_T")
 # Also the closest there is to say of a state at which the energy is not defined. Older
 # versions of Optimistix have no word for it.
 NONFINITE: Any = getattr(dfx.RESULTS, "nonfinite", dfx.RESULTS.nonlinear_divergence)
@@ -33,9 +34,9 @@ class System(eqx.Module):
     args: PyTree
     direction: int | Array
 
-    def time(self, t: Time) -> Time:
+    def time(self, t: ArrayLike) -> Array:
         """The physical time, which runs backwards where `direction` is -1."""
-        return t * cast_to(self.direction, t)
+        return jnp.asarray(t) * cast_to(self.direction, t)
 
     # States.
 
@@ -47,7 +48,7 @@ class System(eqx.Module):
         """The difference of two states, or parts of these, as arrays."""
         return tree_sub(x, y)
 
-    def values(self, x: PyTree) -> PyTree:
+    def values(self, x: _T) -> _T:
         """The arrays of a state, or part of one."""
         return values(x)
 

@@ -445,6 +445,7 @@ def test_massless_test_particles_have_a_way():
     q0 = jnp.array([[0.0, 0.0], [1.0, 0.0]])
     v0 = jnp.array([[0.0, 0.0], [0.0, 1.0]])
     sol = solve(system, dps.TunedRKN6(), 0.0, 2 * np.pi, np.pi / 20, (q0, v0))
+    assert sol.ys is not None
     assert_close(sol.ys[0][-1], q0, 1e-8)
 
 

@@ -41,7 +41,7 @@ wrappers = pytest.mark.parametrize("wrap", WRAPPERS.values(), ids=WRAPPERS)
 _finder = optx.Newton(rtol=1e-12, atol=1e-12)
 
 
-def one_step(solver, hamiltonian=DAMPED):
+def one_step(solver, hamiltonian: dps.AbstractHamiltonian = DAMPED):
     return step(hamiltonian, solver, T0, T1, Y0)[0]
 
 
@@ -182,8 +182,9 @@ def test_compensation_saves_digits(solver):
 
     def end(solver, dtype):
         y0 = jax.tree.map(lambda x: x.astype(dtype), Y0)
-        times = (jnp.asarray(x, dtype) for x in (0.0, 64.0 * half, 2.0**-5))
-        sol = solve(undamped, solver, *times, y0, max_steps=2**14)
+        t0, t1, h = (jnp.asarray(x, dtype) for x in (0.0, 64.0 * half, 2.0**-5))
+        sol = solve(undamped, solver, t0, t1, h, y0, max_steps=2**14)
+        assert sol.ys is not None
         return np.concatenate([np.asarray(y[-1], np.float64) for y in sol.ys])
 
     if isinstance(solver, dps.PresymplecticMidpoint):
@@ -211,8 +212,8 @@ def test_steps_of_nominal_length_inside_others(wrap):
     t0, h, steps = 1.5e4, 2.0**-7, 64
     y0 = (jnp.array([1.0], jnp.float32), jnp.array([0.0], jnp.float32))
     base = dps.Compensated(dps.PresymplecticLeapfrog(), length=h)
-    times = (jnp.asarray(t, jnp.float32) for t in (t0, t0 + steps * h, h))
-    sol = solve(oscillator(0.0), wrap(base), *times, y0)
+    t0, t1, dt0 = (jnp.asarray(t, jnp.float32) for t in (t0, t0 + steps * h, h))
+    sol = solve(oscillator(0.0), wrap(base), t0, t1, dt0, y0)
     assert sol.ys is not None
     end = np.array([y[-1, 0] for y in sol.ys])
     np.testing.assert_allclose(end, [np.cos(steps * h), -np.sin(steps * h)], atol=2e-4)

@@ -13,7 +13,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
 from .._misc import tree_sum
-from .._solver._engine import Span, undo, vjp_step
+from .._solver._engine import Span, undo, vjp, vjp_step
 from .._system import System
 from ._saves import is_within, materialise, Saved, SavedOutputs
 
@@ -104,13 +104,9 @@ class Backward:
             at, start_bar = lax.cond(self._interpolates(at.left, n), inner, skip, at)
         if start is None:
             pulled = vjp_step(moves, system, self.wanted, span, at.state, at.bar)
+            start, more, bar = pulled
         else:
-            wanted, rest = eqx.partition(system, self.wanted)
-            redo = lambda wanted, x: solver.advance(
-                eqx.combine(wanted, rest), *span, *x
-            )[:2]
-            pulled = start, *jax.vjp(redo, wanted, start)[1](at.bar)
-        start, more, bar = pulled
+            more, bar = vjp(moves, system, self.wanted, span, start, at.bar)
         more = (more, jtu.tree_map(jnp.zeros_like, self.moved[1]))
         gradient, bar = tree_sum((at.gradient, bar), (more, start_bar))
         return Position(n, self.time(n), start, bar, gradient, at.left)

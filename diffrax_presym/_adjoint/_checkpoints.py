@@ -16,15 +16,15 @@ def gradient(
     """The cotangents of the state at the start, and of the parameters."""
     final = backward.final
     eps = max(jnp.finfo(x.dtype).eps for x in jtu.tree_leaves(final.y))
-    tol = float(eps) ** (2 / 3) if tol is None else tol
+    limit = float(eps) ** (2 / 3) if tol is None else tol
     most = checkpoints + 1
     end = backward.end()
     states = _Checkpoints(backward, most)
-    hopeless = ~(states.amplification() * float(eps) <= tol)
+    hopeless = ~(states.amplification() * float(eps) <= limit)
 
     def again(x):
         _, miss, tried = x
-        return (tried == 0) | (~(miss <= tol) & (tried < most))
+        return (tried == 0) | (~(miss <= limit) & (tried < most))
 
     def attempt(x):
         _, _, tried = x
@@ -36,7 +36,7 @@ def gradient(
     start = backward.start(states.first_step(start))
     # A solve that diverged has a gradient of NaN anyway.
     finite = [jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(final.y)]
-    missed = ~(miss <= tol) & jnp.all(jnp.stack(finite))
+    missed = ~(miss <= limit) & jnp.all(jnp.stack(finite))
     return eqx.error_if(
         (start.bar, start.gradient),
         missed,

@@ -1,4 +1,5 @@
 import abc
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -6,8 +7,15 @@ from jaxtyping import Array, Bool, Inexact, PyTree
 
 from .._friction import AbstractDamping
 from .._friction._base import Scalar, Time
-from .._misc import AbstractVar, as_time, tree_scale
+from .._misc import as_time, tree_scale
 from .._split import AbstractSplit
+
+
+if TYPE_CHECKING:
+    # To a type checker an abstract field is any kind of field.
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 Q = PyTree[Inexact[Array, "..."]]
@@ -27,6 +35,10 @@ class AbstractHamiltonian(eqx.Module):
     """
 
     damping: AbstractVar[AbstractDamping | None]
+    # The pairs of exact moves that the motion may be made of, the best first. For
+    # example `(KineticSplit(separable=True, nystrom=False),)`, or `()` if no flow of a
+    # part of the energy is known.
+    splits: AbstractVar[tuple[AbstractSplit, ...]]
 
     @abc.abstractmethod
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
@@ -39,15 +51,6 @@ class AbstractHamiltonian(eqx.Module):
     @abc.abstractmethod
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         r"""The force $-\partial E / \partial q$, without the friction."""
-
-    @property
-    @abc.abstractmethod
-    def splits(self) -> tuple[AbstractSplit, ...]:
-        """The pairs of exact moves that the motion may be made of, the best first.
-
-        For example `(KineticSplit(separable=True, nystrom=False),)`; empty if no flow
-        of a part of the energy is known.
-        """
 
     @abc.abstractmethod
     def kinetic_flow(

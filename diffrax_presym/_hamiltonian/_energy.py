@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -8,7 +9,7 @@ from jaxtyping import Array, Bool, PyTree
 
 from .._friction import AbstractDamping
 from .._friction._base import Scalar, Time
-from .._misc import AbstractVar, all_finite, match, scalar_fn
+from .._misc import all_finite, match, scalar_fn
 from .._split import AbstractSplit, KineticSplit, PotentialSplit, SharedSplit
 from ._base import AbstractHamiltonian, P, Q
 from ._kinetic import (
@@ -18,6 +19,13 @@ from ._kinetic import (
     QuadraticKinetic,
 )
 from ._potential import QuadraticPotential
+
+
+if TYPE_CHECKING:
+    # To a type checker an abstract field is any kind of field.
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 def check_callable(fn, name: str, signature: str, optional: bool = False):
@@ -79,16 +87,16 @@ class SeparableEnergy(eqx.Module):
             slope = jax.grad(potential, argnums=1)(t, q, args)
         return jtu.tree_map(jnp.negative, slope)
 
-    @property
-    def splits(self) -> tuple[AbstractSplit, ...]:
+    def splits(self, damping: AbstractDamping | None) -> tuple[AbstractSplit, ...]:
         kinetic = self.kinetic if self.velocity_fn is None else None
         nystrom = kinetic is not None and kinetic.is_quadratic
-        splits = [KineticSplit(separable=True, nystrom=nystrom)]
+        kinetic_split = KineticSplit(separable=True, nystrom=nystrom)
+        splits: list[AbstractSplit] = [kinetic_split]
         if self.force_fn is None and isinstance(self.potential, QuadraticPotential):
             splits.append(PotentialSplit())
         # The mass is constant, as it is not for every energy quadratic in `p`.
         if isinstance(kinetic, QuadraticKinetic):
-            splits.append(SharedSplit(kinetic))
+            splits.append(SharedSplit(kinetic, damping))
         return tuple(splits)
 
     def displacement(self, t: Time, h: Time, p: P, args: PyTree, damping, order) -> Q:
@@ -129,8 +137,7 @@ class GeneralEnergy(eqx.Module):
             return jtu.tree_map(jnp.negative, slope)
         return match(self.force_fn(t, q, p, args), q, "`force`", "`q`")
 
-    @property
-    def splits(self) -> tuple[AbstractSplit, ...]:
+    def splits(self, damping: AbstractDamping | None) -> tuple[AbstractSplit, ...]:
         return ()
 
     def displacement(self, t: Time, h: Time, p: P, args: PyTree, damping, order) -> Q:
@@ -160,7 +167,7 @@ class AbstractMechanicalHamiltonian(AbstractHamiltonian):
 
     @property
     def splits(self) -> tuple[AbstractSplit, ...]:
-        return self.E.splits
+        return self.E.splits(self.damping)
 
     def kinetic_flow(
         self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8

@@ -21,9 +21,9 @@ class AbstractScaling(eqx.Module):
     $e^{-\beta}$.
     """
 
-    @abc.abstractmethod
     def alpha(self, t: Time) -> Scalar:
         r"""The function $\alpha(t)$."""
+        return jnp.log(self.rate(t))
 
     @abc.abstractmethod
     def beta(self, t: Time) -> Scalar:
@@ -42,9 +42,9 @@ class AbstractScaling(eqx.Module):
     def strength(self, t: Time) -> Scalar:
         r"""The strength $e^{\alpha(t) + \beta(t)}$ of the objective."""
 
-    @abc.abstractmethod
     def is_valid(self, t: Time) -> Bool[Array, ""] | None:
         """Whether the conditions hold at a time; `None` if they always do."""
+        return None
 
 
 class PolynomialScaling(AbstractScaling):
@@ -72,9 +72,6 @@ class PolynomialScaling(AbstractScaling):
         """
         self.c = as_positive(c, "`PolynomialScaling(c)`")
         self.C = as_positive(C, "`PolynomialScaling(c, C)`")
-
-    def alpha(self, t: Time) -> Scalar:
-        return jnp.log(self.rate(t))
 
     def beta(self, t: Time) -> Scalar:
         t = as_time(t)
@@ -120,9 +117,6 @@ class ExponentialScaling(AbstractScaling):
         self.c = as_positive(c, "`ExponentialScaling(c)`")
         self.C = as_positive(C, "`ExponentialScaling(c, C)`")
 
-    def alpha(self, t: Time) -> Scalar:
-        return jnp.log(self.rate(t))
-
     def beta(self, t: Time) -> Scalar:
         t = as_time(t)
         return cast_to(self.c, t) * t + jnp.log(cast_to(self.C, t))
@@ -138,9 +132,6 @@ class ExponentialScaling(AbstractScaling):
         t = as_time(t)
         c, C = cast_to(self.c, t), cast_to(self.C, t)
         return c * C * jnp.exp(c * t)
-
-    def is_valid(self, t: Time) -> Bool[Array, ""] | None:
-        return None
 
 
 class Scaling(AbstractScaling):

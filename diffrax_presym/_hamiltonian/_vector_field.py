@@ -1,17 +1,9 @@
-from collections.abc import Callable
-
-from jaxtyping import PyTree
-
 from .._friction import AbstractDamping, as_damping
-from .._friction._base import Scalar, Time
-from .._misc import match
-from .._split import AbstractSplit, KineticSplit
-from ._base import AbstractHamiltonian, P, Q
-from ._energy import check_callable
-from ._kinetic import integrate_velocity
+from .._friction._base import Scalar
+from ._energy import AbstractMechanicalHamiltonian, check_callable, SeparableEnergy
 
 
-class VectorField(AbstractHamiltonian):
+class VectorField(AbstractMechanicalHamiltonian):
     """A velocity and a force written by hand, with no energy known.
 
     For forces that have no potential, that are random, or whose potential is not worth
@@ -22,8 +14,7 @@ class VectorField(AbstractHamiltonian):
     `jax.custom_jvp` there.
     """
 
-    velocity_fn: Callable
-    force_fn: Callable
+    E: SeparableEnergy
     damping: AbstractDamping | None
 
     def __init__(self, velocity, force, damping=None):
@@ -43,29 +34,13 @@ class VectorField(AbstractHamiltonian):
         """
         check_callable(velocity, "velocity", "velocity(t, p, args)")
         check_callable(force, "force", "force(t, q, args)")
-        self.velocity_fn = velocity
-        self.force_fn = force
+        self.E = SeparableEnergy(_no_energy, _no_energy, velocity, force)
         self.damping = None if damping is None else as_damping(damping, "`damping`")
 
-    @property
-    def splits(self) -> tuple[AbstractSplit, ...]:
-        return (KineticSplit(separable=True, nystrom=False),)
 
-    def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
-        raise ValueError(
-            "A `VectorField` has no energy: it knows only its velocity and force. If "
-            "they derive from an energy T(t, p) + V(t, q), write "
-            "`ConformalHamiltonian(kinetic, potential, damping)` instead."
-        )
-
-    def velocity(self, t: Time, q: Q, p: P, args: PyTree = None) -> Q:
-        return match(self.velocity_fn(t, p, args), p, "`velocity`", "`p`")
-
-    def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
-        return match(self.force_fn(t, q, args), q, "`force`", "`q`")
-
-    def kinetic_flow(
-        self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8
-    ) -> tuple[Q, None]:
-        velocity = lambda t, p, args: self.velocity(t, q, p, args)
-        return integrate_velocity(velocity, t, h, p, args, self.damping, order), None
+def _no_energy(*args) -> Scalar:
+    raise ValueError(
+        "A `VectorField` has no energy: it knows only its velocity and force. If they "
+        "derive from an energy T(t, p) + V(t, q), write `ConformalHamiltonian(kinetic, "
+        "potential, damping)` instead."
+    )

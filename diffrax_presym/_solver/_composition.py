@@ -1,13 +1,12 @@
 import math
 from decimal import Decimal, localcontext
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
 import optimistix as optx
 from jaxtyping import PyTree
 
-from .._misc import AbstractVar
 from .._system import System
 from ._base import AbstractPresymplecticSolver
 from ._engine import Moves, Stages
@@ -20,6 +19,13 @@ from ._tableaus import (
     SUZUKI_4,
 )
 from ._wrapper import AbstractWrapper
+
+
+if TYPE_CHECKING:
+    # To a type checker an abstract field is any kind of field.
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 Weights = tuple[float, ...]

@@ -101,6 +101,18 @@ def undo(moves: Moves, system: System, span: Span, stage: Stage) -> Stage:
     return forward(moves.inverse, system, span.reversed, stage)[0]
 
 
+def vjp(
+    moves: Moves, system: System, wanted: PyTree, span: Span, start: Stage, bar: Stage
+) -> tuple[PyTree, Stage]:
+    """Pull cotangents back through moves, from a state at their start that is known.
+
+    To what is `wanted` of the system, and to that state.
+    """
+    moved, fixed = eqx.partition(system, wanted)
+    redo = lambda moved, x: forward(moves, eqx.combine(moved, fixed), span, x)[0]
+    return jax.vjp(redo, moved, start)[1](bar)
+
+
 def vjp_step(
     moves: Moves, system: System, wanted: PyTree, span: Span, end: Stage, bar: Stage
 ) -> tuple[Stage, PyTree, Stage]:
@@ -114,9 +126,7 @@ def vjp_step(
     def back(move: Move, span: Span, x: PyTree) -> Outcome:
         end, gradient, bar = x
         start, _ = move.undo(system, span.reversed, end)
-        moved, fixed = eqx.partition(system, wanted)
-        redo = lambda moved, x: move.do(eqx.combine(moved, fixed), span, x)[0]
-        more, bar = jax.vjp(redo, moved, start)[1](bar)
+        more, bar = vjp(move, system, wanted, span, start, bar)
         return (start, tree_sum(gradient, more), bar), None
 
     gradient = jtu.tree_map(jnp.zeros_like, eqx.filter(system, wanted))

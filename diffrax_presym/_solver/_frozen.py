@@ -1,12 +1,19 @@
-from typing import Generic, Literal, TypeVar
+from typing import Generic, Literal, TYPE_CHECKING, TypeVar
 
 import optimistix as optx
 
-from .._misc import AbstractVar, check_root_finder
+from .._misc import check_root_finder
 from .._system import System
 from ._base import AbstractMoveSolver
 from ._engine import Stages
 from ._moves import frozen_drift, frozen_kick, root_find, RootFind
+
+
+if TYPE_CHECKING:
+    # To a type checker an abstract field is any kind of field.
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 _Carry = TypeVar("_Carry")

@@ -1,11 +1,17 @@
-from typing import Generic, TypeVar
+from typing import Generic, TYPE_CHECKING, TypeVar
 
 from jaxtyping import Array, PyTree
 
-from .._misc import AbstractVar
 from .._split import State
 from .._system import System
 from ._base import AbstractMoveSolver, AbstractPresymplecticSolver
+
+
+if TYPE_CHECKING:
+    # To a type checker an abstract field is any kind of field.
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 _Carry = TypeVar("_Carry")

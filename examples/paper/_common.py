@@ -68,19 +68,13 @@ class Nesterov(dps.AbstractPresymplecticSolver[None]):
     def order(self, terms):
         return 1
 
-    def start(self, system, t, y):
-        return None
-
     def advance(self, system, t0, t1, h, y, carry):
         q, p = y
         h = h.astype(q.dtype)
         p = system.move_frame(t0, h, p)
-        ahead = q + h * system.velocity(t1, (q, p))
-        p = p + h * system.force(t1, (ahead, p))
-        return (q + h * system.velocity(t1, (q, p)), p), None, None
-
-    def slope(self, system, t, y, carry):
-        return system.slope(t, y)
+        ahead = system.add(q, h, system.velocity(t1, (q, p)))
+        p = system.add(p, h, system.force(t1, (ahead, p)))
+        return (system.add(q, h, system.velocity(t1, (q, p))), p), None, None
 
 
 def growth(ts, errors, first, last) -> float:
