@@ -16,7 +16,7 @@ FOLDER = pathlib.Path(__file__).parent.parent / "docs/img"
 GROUPS = ("o-", "s--", "^:")
 
 
-def panels(count, columns, size):
+def panels(count, columns, size, **options):
     """A figure of `count` panels, each of a `size` in inches, and its axes."""
     rows = -(-count // columns)
     fig, axes = plt.subplots(
@@ -25,6 +25,7 @@ def panels(count, columns, size):
         figsize=(size[0] * columns, size[1] * rows),
         layout="constrained",
         squeeze=False,
+        **options,
     )
     for ax in axes.flat[:count]:
         ax.grid(alpha=0.3)
@@ -43,7 +44,8 @@ def colors(names):
     """A color for each name: the strong ones of the palette first."""
     palette = plt.get_cmap("tab20")
     return {
-        name: palette((2 * i + i // 10) % 20) for i, name in enumerate(dict.fromkeys(names))
+        name: palette((2 * i + i // 10) % 20)
+        for i, name in enumerate(dict.fromkeys(names))
     }
 
 

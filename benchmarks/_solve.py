@@ -1,4 +1,4 @@
-"""The solves of the benchmarks, and the reference solution that they are held against."""
+"""The solves of the benchmarks, and the reference solution of all of them."""
 
 import diffrax as dfx
 import equinox as eqx
@@ -65,12 +65,16 @@ def final_state(system, solver, times, y0, x, args=None, *, adaptive=False):
 
 def relative_error(y, exact):
     """The largest error, relative to the largest entry of the solution."""
-    y, exact = (np.concatenate([*map(np.ravel, jax.tree.leaves(x))]) for x in (y, exact))
+    y, exact = (
+        np.concatenate([*map(np.ravel, jax.tree.leaves(x))]) for x in (y, exact)
+    )
     return np.max(np.abs(y - exact)) / np.max(np.abs(exact))
 
 
-def reference(hamiltonian, y0, times, args=None, *, tolerance=1e-12):
+def reference(hamiltonian, y0, times, args=None, *, tolerance=1e-12, batch=False):
     """The solution at all times after the first, independent of what is measured.
+
+    A `batch` of initial states has a leading axis, and so has its solution.
 
     Gragg, Bulirsch and Stoer's extrapolation of order 10, with compensated summation.
     Steps are halved until the solution changes by less than `tolerance`, relative to
@@ -79,13 +83,18 @@ def reference(hamiltonian, y0, times, args=None, *, tolerance=1e-12):
     2e-13 on the Kepler problem, whose orbit amplifies it.
     """
     y0, times = jax.tree.map(jnp.asarray, y0), jnp.asarray(times)
+    solution = eqx.filter_jit(
+        eqx.filter_vmap(_extrapolated, in_axes=(None, 0, None, None, None))
+        if batch
+        else _extrapolated
+    )
     longest, change = 0.25, np.inf
-    ys = _extrapolated(hamiltonian, y0, times, args, longest)
+    ys = solution(hamiltonian, y0, times, args, longest)
     while not change < tolerance:
         longest /= 2
         if longest < 1e-4:
             raise RuntimeError(f"No reference solution: halving changes it by {change}")
-        before, ys = ys, _extrapolated(hamiltonian, y0, times, args, longest)
+        before, ys = ys, solution(hamiltonian, y0, times, args, longest)
         change = relative_error(before, ys)
     return ys
 
@@ -93,7 +102,6 @@ def reference(hamiltonian, y0, times, args=None, *, tolerance=1e-12):
 LEVELS = 5
 
 
-@eqx.filter_jit
 def _extrapolated(hamiltonian, y0, times, args, longest):
     term = dps.HamiltonianTerm(hamiltonian)
     y0, unravel = ravel_pytree(y0)
