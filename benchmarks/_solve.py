@@ -1,5 +1,7 @@
 """The solves of the benchmarks, and the reference solution of all of them."""
 
+from typing import Any
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -11,7 +13,7 @@ import diffrax_presym as dps
 
 
 LAST = dfx.SaveAt(t1=True)
-CONSTANT: dfx.AbstractStepSizeController = dfx.ConstantStepSize()
+CONSTANT = dfx.ConstantStepSize()
 
 
 def solve(
@@ -22,10 +24,10 @@ def solve(
     dt0,
     y0,
     args=None,
-    controller=CONSTANT,
+    controller: dfx.AbstractStepSizeController = CONSTANT,
     saveat=LAST,
     **options,
-):
+) -> dfx.Solution:
     """`diffeqsolve` of a Hamiltonian, or of terms; a failure is a result."""
     if isinstance(system, dps.AbstractHamiltonian):
         system = dps.HamiltonianTerm(system)
@@ -43,7 +45,7 @@ def solve(
     )
 
 
-def last(sol):
+def last(sol) -> Any:
     """The final state of a solve."""
     return jax.tree.map(lambda y: y[-1], sol.ys)
 
