@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 
 
 FOLDER = pathlib.Path(__file__).parent.parent / "docs/img"
-# What tells the groups of methods in a figure apart.
+# Marker and line of each group of methods.
 GROUPS = ("o-", "s--", "^:")
 
 

@@ -287,7 +287,7 @@ def heyoka_runs(batch, n, errors):
     return runs
 
 
-def beside_heyoka(batch, methods, n, repeats):
+def compare_with_heyoka(batch, methods, n, repeats):
     errors = Errors(batch, n)
     tuned = tune_all(batch, methods, errors)
     y0 = batch.starts(n)
@@ -369,7 +369,7 @@ def main():
     scaling(pendulums(), methods, sizes, repeats, longest)
     few = [m for m in methods if m in OURS[2:] + RIVALS[3:]]
     for batch in pendulums(), henon_heiles():
-        beside_heyoka(batch, few, sizes[-1] if quick else 1024, repeats)
+        compare_with_heyoka(batch, few, sizes[-1] if quick else 1024, repeats)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ default, and with reverse mode through a `lax.scan` written by hand, whose numbe
 steps is fixed when it is compiled. Runs that would take too long or too much memory are
 omitted, and those of minutes are made once.
 
-Memory is what XLA reports that the compiled program needs besides its arguments.
+Memory is what XLA reports that the compiled program needs in addition to its arguments.
 """
 
 import functools

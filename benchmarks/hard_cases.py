@@ -1,4 +1,4 @@
-"""The hard cases: what happens, and how schemes of every kind fare. One table a group.
+"""The hard cases: errors and costs of all kinds of schemes, one table per group.
 
 Errors are the same on any machine; costs are ratios of times of interleaved runs, the
 median of several.
@@ -531,7 +531,7 @@ EVERYONE: dict[str, Scheme] = {
 
 
 def every_scheme(quick):
-    """All schemes in all cases where one number tells, by as many evaluations."""
+    """All schemes at equal numbers of evaluations, in all cases with a single error."""
     e, gamma = 0.9, 20.0
     slow, fast = np.roots([1.0, gamma, 1.0])[::-1]
     settled = (slow * np.exp(fast * 50) - fast * np.exp(slow * 50)) / (slow - fast)
