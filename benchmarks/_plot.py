@@ -55,7 +55,8 @@ def slope(ax, x, y, power, label=None):
     ax.loglog(x, y * (x / x[0]) ** power, ":", color="0.5", lw=1)
     if label:
         where = np.sqrt(x[0] * x[-1])
-        ax.text(where, y * (where / x[0]) ** power, label, color="0.4", fontsize=7)
+        style = {"color": "0.4", "fontsize": 7, "clip_on": True}
+        ax.text(where, y * (where / x[0]) ** power, label, **style)
 
 
 def error_against_time(results, groups, path, columns):
