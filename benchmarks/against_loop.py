@@ -1,18 +1,19 @@
 """`diffeqsolve` with our schemes against hand-written loops of the same schemes.
 
-Both sides run in one process, compiled and warmed up, by turns; a row gives the median
-time per step of each and the median of the ratios. A loop carries time, evaluates the
-damping at each step, and does nothing else.
+A row gives the median time per step of each side, and the median of the ratios of
+interleaved runs. A loop carries time, evaluates the damping at each step, and does
+nothing else.
 """
 
-import argparse
-import statistics
-import time
+import functools
 
 import diffrax as dfx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
+from _report import command_line, Table
+from _solve import last, solve
+from _timing import interleaved
 
 import diffrax_presym as dps
 
@@ -105,88 +106,63 @@ def ours(potential, solver, saveat, every=1, max_steps=None, step_to=None):
     hamiltonian = dps.ConformalHamiltonian(
         dps.QuadraticKinetic(), potential, dps.ConstantDamping(GAMMA)
     )
-    term = dps.HamiltonianTerm(hamiltonian)
-    controller = dfx.ConstantStepSize() if step_to is None else dfx.StepTo(step_to)
 
     @jax.jit
-    def solve(q, p, steps):
-        sol = dfx.diffeqsolve(
-            term,
-            solver,
-            t0=0.0,
-            t1=steps * DT if step_to is None else step_to[-1],
-            dt0=every * DT if step_to is None else None,
-            y0=(q, p),
-            saveat=saveat,
-            max_steps=max_steps,
-            stepsize_controller=controller,
+    def run(q, p, steps):
+        t1, dt0, controller = steps * DT, every * DT, dfx.ConstantStepSize()
+        if step_to is not None:
+            t1, dt0, controller = step_to[-1], None, dfx.StepTo(step_to)
+        options = {"saveat": saveat, "max_steps": max_steps, "throw": True}
+        sol = solve(
+            hamiltonian, solver, 0.0, t1, dt0, (q, p), None, controller, **options
         )
-        return jax.tree.map(lambda x: x[-1], sol.ys)
+        return last(sol)
 
-    return solve
-
-
-def compare(solve, loop, q, p, steps, repeats):
-    def timed(fn):
-        start = time.perf_counter()
-        jax.block_until_ready(fn(q, p, steps))
-        return (time.perf_counter() - start) / steps
-
-    for fn in (solve, loop):
-        timed(fn)
-    pairs = [(timed(solve), timed(loop)) for _ in range(repeats)]
-    medians = [statistics.median(side) for side in zip(*pairs, strict=True)]
-    return *medians, statistics.median(a / b for a, b in pairs)
+    return run
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a short run, for CI")
-    quick = parser.parse_args().quick
+    quick = command_line(__doc__).parse_args().quick
     repeats = 3 if quick else 15
     sizes = {1: 100_000, 1000: 10_000, 100_000: 200}
     if quick:
         sizes = {n: steps // 50 for n, steps in sizes.items()}
-    print(
-        f"{'potential':>9} {'unknowns':>8} {'scheme, saved':>26}"
-        f" {'ours, ns':>9} {'loop, ns':>9} {'ratio':>6}"
+    table = Table(
+        None,
+        "potential:>9",
+        "unknowns:>8",
+        "scheme, saved:>26",
+        "ours, ns:>9.0f",
+        "loop, ns:>9.0f",
+        "ratio:>6.2f",
     )
+    ten = dps.Substeps(LEAPFROG, 10)
     for name, potential in POTENTIALS.items():
         leapfrog, splitting = leapfrog_loop(potential), splitting_loop(potential)
         for n, steps in sizes.items():
             q = jnp.linspace(0.5, 1.0, n) if n > 1 else jnp.array(0.5)
-            p = jnp.zeros_like(q)
+            y0 = q, jnp.zeros_like(q)
+            solver_of = functools.partial(ours, potential)
             end = dfx.SaveAt(t1=True)
             points = dfx.SaveAt(ts=jnp.linspace(0, steps * DT, 11))
             grid = jnp.arange(steps + 1) * DT
-            ten = dps.Substeps(LEAPFROG, 10)
             cases = {
-                "leapfrog, t1": (ours(potential, LEAPFROG, end), leapfrog),
-                "leapfrog, t1, StepTo": (
-                    ours(potential, LEAPFROG, end, step_to=grid),
-                    leapfrog,
-                ),
-                "leapfrog, t1, Substeps(10)": (ours(potential, ten, end, 10), leapfrog),
-                "leapfrog, ts": (ours(potential, LEAPFROG, points), leapfrog),
-                "leapfrog, ts, Substeps(10)": (
-                    ours(potential, ten, points, 10),
-                    leapfrog,
-                ),
-                "BlanesMoanRKN6, t1": (ours(potential, RKN6, end), splitting),
+                "leapfrog, t1": solver_of(LEAPFROG, end),
+                "leapfrog, t1, StepTo": solver_of(LEAPFROG, end, step_to=grid),
+                "leapfrog, t1, Substeps(10)": solver_of(ten, end, 10),
+                "leapfrog, ts": solver_of(LEAPFROG, points),
+                "leapfrog, ts, Substeps(10)": solver_of(ten, points, 10),
+                "BlanesMoanRKN6, t1": solver_of(RKN6, end),
             }
             if n * steps <= 10_000_000:
                 every = dfx.SaveAt(steps=True)
-                cases["leapfrog, steps"] = (
-                    ours(potential, LEAPFROG, every, max_steps=steps),
-                    leapfrog,
-                )
-            for case, (solve, loop) in cases.items():
-                mine, theirs, ratio = compare(solve, loop, q, p, steps, repeats)
-                print(
-                    f"{name:>9} {n:>8} {case:>26} {mine * 1e9:>9.0f}"
-                    f" {theirs * 1e9:>9.0f} {ratio:>6.2f}",
-                    flush=True,
-                )
+                cases["leapfrog, steps"] = solver_of(LEAPFROG, every, max_steps=steps)
+            for case, solver in cases.items():
+                sides = solver, splitting if "RKN6" in case else leapfrog
+                calls = [functools.partial(side, *y0, steps) for side in sides]
+                mine, loop = interleaved(dict(enumerate(calls)), repeats).values()
+                times = (side.median / steps * 1e9 for side in (mine, loop))
+                table.row(name, n, case, *times, mine.over(loop))
 
 
 if __name__ == "__main__":

@@ -1,13 +1,12 @@
-"""Many trajectories at once: time per trajectory under `vmap`, beside the error.
+"""Many trajectories at once: time per trajectory under `vmap`, and the error.
 
 Damped pendulums to t = 100 from different starting points. Step sizes and tolerances
 are tuned, so that every method has the same error: the largest over the first starting
 points, of which the first is the hardest, relative to the largest entry of the
-solution, against tiny steps of Dopri8. The error beside each time is the largest over
-the batch, or its first 4096 members. Everything runs in one process, compiled and
-warmed up, by turns; a number is the median, or one run if that takes seconds. Where the
-time for a smaller batch says that a solve would take too long, and where it would take
-more than a million steps, it is left out.
+solution. The error next to each time is the largest over the batch, or its first 4096
+members. A time is the median of interleaved runs, or one run if that takes seconds.
+Solves are omitted if the time for a smaller batch predicts that they take too long, and
+if they take more than a million steps.
 
 The other tables are batches of 1024: damped Henon-Heiles systems, whose force is a
 polynomial, and the pendulums with what else matters on a CPU: the sine, which XLA
@@ -16,22 +15,24 @@ into blocks, `jax.lax.map(solve, y0, batch_size=512)`, too small for XLA to spre
 operation over threads, which costs more than it gains at this size. heyoka is
 measured if it is installed, as it is used for many trajectories: one after the other,
 and as many at a time as the processor has lanes. It runs on one core, where XLA may use
-all, so the second column is the time of all cores together: also the steadier of the
+all, so the second column is the time summed over all cores: also the steadier of the
 two on a machine with other work.
 """
 
-import argparse
 import dataclasses
+import functools
 import math
-import statistics
-import time
 from collections.abc import Callable
+from typing import NamedTuple
 
-import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import problems
+from _report import command_line, Table
+from _schemes import DIFFRAX, Scheme, SCHEMES
+from _solve import final_state, reference
+from _timing import interleaved, timed
 from outside import symbolic
 
 import diffrax_presym as dps
@@ -46,25 +47,25 @@ CHECKED = 4096
 MOST_STEPS = 1e6
 
 
-@dataclasses.dataclass(frozen=True)
-class Method:
+class Method(NamedTuple):
     name: str
-    solver: dfx.AbstractSolver
-    order: int
+    scheme: Scheme
     adaptive: bool = False
 
 
 OURS = [
-    Method("PresymplecticLeapfrog", dps.PresymplecticLeapfrog(), 2),
-    Method("BlanesMoanRKN4", dps.BlanesMoanRKN4(), 4),
-    Method("BlanesMoanRKN6", dps.BlanesMoanRKN6(), 6),
-    Method("BlanesCasasRKN8", dps.BlanesCasasRKN8(), 8),
+    Method(name, SCHEMES[name])
+    for name in (
+        "PresymplecticLeapfrog",
+        "BlanesMoanRKN4",
+        "BlanesMoanRKN6",
+        "BlanesCasasRKN8",
+    )
 ]
-DIFFRAX = [
-    Method("Tsit5, constant", dfx.Tsit5(), 5),
-    Method("Tsit5, adaptive", dfx.Tsit5(), 5, adaptive=True),
-    Method("Dopri8, constant", dfx.Dopri8(), 8),
-    Method("Dopri8, adaptive", dfx.Dopri8(), 8, adaptive=True),
+RIVALS = [
+    Method(f"{name}, {kind}", DIFFRAX[name], kind == "adaptive")
+    for name in ("Tsit5", "Dopri8")
+    for kind in ("constant", "adaptive")
 ]
 
 
@@ -79,7 +80,7 @@ class Batch:
 
 def spread(n, *boxes):
     """The first `n` of a sequence that fills a box, of `(first, side)` each way."""
-    # The powers of the root of x^(d+1) = x + 1, the golden ratio's kin.
+    # A Kronecker sequence by the root of x^(d+1) = x + 1, the golden ratio if d = 1.
     ratio = max(np.roots([1] + [0] * (len(boxes) - 1) + [-1, -1]).real)
     powers = ratio ** -np.arange(1.0, len(boxes) + 1)
     i = np.arange(n)
@@ -90,14 +91,14 @@ def spread(n, *boxes):
 
 
 def polynomial_sine(x):
-    """The sine to 2e-16 for moderate arguments, of what XLA can vectorise."""
-    turns = jnp.round(x / math.pi)
-    x = (x - turns * math.pi) - turns * 1.2246467991473532e-16
+    """The sine to 2e-16 for moderate arguments, in operations that XLA vectorises."""
+    halves = jnp.round(x / math.pi)
+    x = (x - halves * math.pi) - halves * 1.2246467991473532e-16
     square, series = x * x, 0.0
     for k in range(10, 0, -1):
         series = (series + (-1) ** k / math.factorial(2 * k + 1)) * square
     x = x + x * series
-    return jnp.where(turns - 2 * jnp.floor(turns / 2) == 0, x, -x)
+    return jnp.where(halves - 2 * jnp.floor(halves / 2) == 0, x, -x)
 
 
 def pendulums():
@@ -128,25 +129,10 @@ def henon_heiles():
 
 def batched(hamiltonian, t1, method, block=None):
     """`solve(y0, x)`, with `x` the number of steps, or the tolerance."""
-    term = dps.HamiltonianTerm(hamiltonian)
-
-    def one(y0, x):
-        controller = dfx.ConstantStepSize()
-        if method.adaptive:
-            controller = dfx.PIDController(rtol=x, atol=x)
-        sol = dfx.diffeqsolve(
-            term,
-            method.solver,
-            t0=0.0,
-            t1=t1,
-            dt0=None if method.adaptive else t1 / x,
-            y0=y0,
-            max_steps=None,
-            throw=False,
-            stepsize_controller=controller,
-        )
-        return jax.tree.map(lambda y: y[-1], sol.ys)
-
+    solver, adaptive = method.scheme.solver, method.adaptive
+    one = lambda y0, x: final_state(
+        hamiltonian, solver, (0.0, t1), y0, x, adaptive=adaptive
+    )
     if block is None:
         return jax.jit(jax.vmap(one, in_axes=(0, None)))
     blocks = lambda y0, x: jax.lax.map(lambda y: one(y, x), y0, batch_size=block)
@@ -163,11 +149,11 @@ class Errors:
     """The largest error over a batch, relative to the largest entry of the solution."""
 
     def __init__(self, batch, n):
-        fine = batched(batch.problem.hamiltonian, batch.problem.t1, DIFFRAX[2])
-        y0 = batch.starts(n)
-        self.exact = rows(fine(y0, jnp.asarray(4e3)))
+        problem = batch.problem
+        times = [0.0, problem.t1]
+        ys = reference(problem.hamiltonian, batch.starts(n), times, batch=True)
+        self.exact = rows(jax.tree.map(lambda y: y[:, 0], ys))
         self.largest = np.max(np.abs(self.exact))
-        assert self.of(fine(y0, jnp.asarray(3e3))) < 1e-12
 
     def of(self, y):
         y = rows(y)
@@ -188,39 +174,19 @@ def tune(solve, method, target, errors, y0):
             good = x
             if error > target / 1.5:
                 break
-        # Never by too much at once: far from the target the order is not yet seen.
+        # A limited change: the order shows only close to the target.
         factor = max(1e-4, min(1e4, 0.8 * target / error))
         if method.adaptive:
             x = max(1e-15, x * factor)
         else:
-            x = math.ceil(x * max(0.5, factor ** (-1 / method.order)))
+            x = math.ceil(x * max(0.5, factor ** (-1 / method.scheme.order)))
     return good
 
 
-def timed(call):
-    """The result, the seconds, and the seconds of all cores together."""
-    cpu, start = time.process_time(), time.perf_counter()
-    result = jax.block_until_ready(call())
-    return result, time.perf_counter() - start, time.process_time() - cpu
-
-
-def by_turns(calls, repeats):
-    """For each call its result, and the medians of both times."""
-    rounds = [[timed(call) for call in calls.values()] for _ in range(repeats)]
-    results = {}
-    for name, of_one in zip(calls, zip(*rounds, strict=True), strict=True):
-        (*_, y), seconds, cores = zip(*of_one, strict=True)
-        results[name] = y, statistics.median(seconds), statistics.median(cores)
-    return results
-
-
-def program(solve, y0, x, warm=True):
-    """A compiled solve, called once before it counts."""
-    compiled = solve.lower(y0, jnp.asarray(x)).compile()
-    call = lambda: compiled(y0, jnp.asarray(x))
-    if warm:
-        jax.block_until_ready(call())
-    return call
+def program(solve, y0, x):
+    """A compiled solve."""
+    x = jnp.asarray(x)
+    return functools.partial(solve.lower(y0, x).compile(), y0, x)
 
 
 def tune_all(batch, methods, errors):
@@ -237,11 +203,12 @@ def tune_all(batch, methods, errors):
 def scaling(batch, methods, sizes, repeats, longest):
     errors = Errors(batch, min(max(sizes), CHECKED))
     tuned = tune_all(batch, methods, errors)
-    head = "".join(f"{f'batch of {n}':>16}" for n in sizes)
-    print(f"\nMicroseconds per trajectory, and error\n{'':24}{head}{'per second':>11}")
+    print("\nMicroseconds per trajectory, and error")
     for target in TARGETS:
+        heads = [f"batch of {n}:>15" for n in sizes]
+        table = Table("", f"error {target:.0e}:<24", *heads, "per second:>10.0f")
         cells = {method.name: [] for method in methods}
-        rates = dict.fromkeys(cells, 0.0)
+        rates = dict.fromkeys(cells)
         last = dict.fromkeys(cells, 0.0)
         for n in sizes:
             y0 = batch.starts(n)
@@ -252,23 +219,22 @@ def scaling(batch, methods, sizes, repeats, longest):
                 if x is not None and expected < longest:
                     # One run is enough where noise has time to average out.
                     group = short if expected < 1 else long
-                    group[method.name] = program(solve, y0, x, warm=group is short)
-            found = by_turns(short, repeats) | by_turns(long, 1)
-            for name, (y, seconds, _) in found.items():
-                each = seconds / n
+                    group[method.name] = program(solve, y0, x)
+            found = interleaved(short, repeats) | interleaved(long, 1, warm_up=False)
+            for name, timing in found.items():
+                each = timing.median / n
                 last[name] = each if n >= 64 else 0.0
-                rates[name] = max(rates[name], 1 / each)
-                cells[name].append(f"{each * 1e6:.1f} {errors.of(y):.0e}")
+                rates[name] = max(rates[name] or 0.0, 1 / each)
+                error = errors.of(timing.result)
+                cells[name].append(f"{each * 1e6:.1f} {error:.0e}")
             for name in cells.keys() - found.keys():
-                cells[name].append("-")
-        print(f"error {target:.0e}")
+                cells[name].append(None)
         for name, row in cells.items():
-            rate = f"{rates[name]:>11.0f}" if rates[name] else f"{'-':>11}"
-            print(f"  {name:22}" + "".join(f"{c:>16}" for c in row) + rate, flush=True)
+            table.row(f"  {name}", *row, rates[name])
 
 
 def heyoka_runs(batch, n, errors):
-    """heyoka over a batch: one by one, and by the lanes of the processor."""
+    """heyoka over a batch: one trajectory at a time, and one per lane."""
     try:
         import heyoka as hy  # pyright: ignore[reportMissingImports]
     except ImportError:
@@ -317,12 +283,11 @@ def heyoka_runs(batch, n, errors):
             tolerances = [target * 10 ** (-k / 2) for k in range(7)]
             solves = [make(tolerance) for tolerance in tolerances]
             reach = [s for s in solves if errors.of(s()) <= target]
-            fastest = min(reach, key=lambda s: timed(s)[1])
-            runs[name, target] = fastest
+            runs[name, target] = min(reach, key=lambda s: timed(s)[1])
     return runs
 
 
-def beside_heyoka(batch, methods, n, repeats):
+def compare_with_heyoka(batch, methods, n, repeats):
     errors = Errors(batch, n)
     tuned = tune_all(batch, methods, errors)
     y0 = batch.starts(n)
@@ -338,26 +303,31 @@ def beside_heyoka(batch, methods, n, repeats):
                         key = f"{method.name:17}{how}", target
                         calls[key] = program(solve, y0, x)
     calls |= heyoka_runs(batch, n, errors)
-    found = by_turns(calls, repeats)
-    print(
-        f"\n{batch.problem.name}, a batch of {n}: microseconds per trajectory, "
-        f"of all cores, and error\n{'':48}"
-        + "".join(f"{f'error {t:.0e}':>22}" for t in TARGETS)
+    found = interleaved(calls, repeats)
+    table = Table(
+        f"{batch.problem.name}, a batch of {n}: microseconds per trajectory, "
+        "summed over all cores, and error",
+        ":<47",
+        *(f"error {target:.0e}:>21" for target in TARGETS),
     )
     for name in dict.fromkeys(name for name, _ in calls):
-        row = ""
+        row = []
         for target in TARGETS:
-            cell = "-"
-            if (name, target) in found:
-                y, *times = found[name, target]
-                us = [t / n * 1e6 for t in times]
-                cell = f"{us[0]:.1f} {us[1]:>7.1f} {errors.of(y):.0e}"
-            row += f"{cell:>22}"
-        print(f"{name:48}{row}")
-    print("\nThe best of each over our best: in time (in time of all cores)")
-    rivals = {"Diffrax": names(DIFFRAX)}
+            timing = found.get((name, target))
+            if timing is not None:
+                us, cores = (s / n * 1e6 for s in (timing.median, timing.median_cpu))
+                error = errors.of(timing.result)
+                row.append(f"{us:.1f} {cores:>7.1f} {error:.0e}")
+            else:
+                row.append(None)
+        table.row(name, *row)
+    rivals = {"Diffrax": names(RIVALS)}
     rivals |= {name: name for name, _ in calls if name.startswith("heyoka")}
-    print(f"{'':26}" + "".join(f"{rival:>22}" for rival in rivals))
+    table = Table(
+        "The best of each over our best: in time (in time summed over all cores)",
+        ":<26",
+        *(f"{rival}:>21" for rival in rivals),
+    )
     for target in TARGETS:
         for variant in batch.variants:
             row = []
@@ -366,11 +336,10 @@ def beside_heyoka(batch, methods, n, repeats):
                 time, cores = (
                     best(found, target, start, share, clock)
                     / best(found, target, names(OURS), variant, clock)
-                    for clock in (1, 2)
+                    for clock in ("median", "median_cpu")
                 )
                 row.append(f"{time:.1f} ({cores:.1f})")
-            case = f"{target:.0e}, {variant}"
-            print(f"  {case:24}" + "".join(f"{cell:>22}" for cell in row))
+            table.row(f"  {target:.0e}, {variant}", *row)
 
 
 def names(methods):
@@ -379,17 +348,16 @@ def names(methods):
 
 def best(found, target, start, contains, clock):
     return min(
-        result[clock]
-        for (name, t), result in found.items()
+        getattr(timing, clock)
+        for (name, t), timing in found.items()
         if t == target and name.startswith(start) and contains in name
     )
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a short run, for CI")
+    parser = command_line(__doc__)
     parser.add_argument(
-        "--longest", type=float, help="leave out solves that take more seconds"
+        "--longest", type=float, help="omit solves that take more seconds"
     )
     options = parser.parse_args()
     quick = options.quick
@@ -397,11 +365,11 @@ def main():
     longest = options.longest or (0.3 if quick else 12.0)
     sizes = (1, 64, 256) if quick else SIZES
     print(f"{jax.devices()[0].device_kind}, median of {repeats} runs")
-    methods = [OURS[2], DIFFRAX[3]] if quick else OURS + DIFFRAX
+    methods = [OURS[2], RIVALS[3]] if quick else OURS + RIVALS
     scaling(pendulums(), methods, sizes, repeats, longest)
-    few = [m for m in methods if m in OURS[2:] + DIFFRAX[3:]]
+    few = [m for m in methods if m in OURS[2:] + RIVALS[3:]]
     for batch in pendulums(), henon_heiles():
-        beside_heyoka(batch, few, sizes[-1] if quick else 1024, repeats)
+        compare_with_heyoka(batch, few, sizes[-1] if quick else 1024, repeats)
 
 
 if __name__ == "__main__":

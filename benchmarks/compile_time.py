@@ -1,16 +1,17 @@
-"""How long `diffeqsolve` takes to compile with each solver, beside Tsit5.
+"""How long `diffeqsolve` takes to compile with each solver, compared to Tsit5.
 
-The median over fresh compilations of the damped pendulum, by turns, in one process:
-tracing, lowering and XLA together. Nothing is cached between them.
+The median over compilations of the damped pendulum, interleaved in one process:
+tracing, lowering and XLA together, with all caches cleared before each.
 """
 
-import argparse
-import statistics
-import time
+import functools
 
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
+from _report import command_line, Table
+from _solve import solve
+from _timing import interleaved
 
 import diffrax_presym as dps
 
@@ -35,47 +36,38 @@ SOLVERS = {
 }
 
 
-def compile_once(solver, saveat):
+def compiled(solver, saveat):
     potential = lambda t, q, args: -jnp.sum(jnp.cos(q))
     hamiltonian = dps.ConformalHamiltonian(
         dps.QuadraticKinetic(), potential, dps.ConstantDamping(0.1)
     )
-    term = dps.HamiltonianTerm(hamiltonian)
-
-    def solve(q, p):
-        return dfx.diffeqsolve(
-            term, solver, t0=0.0, t1=1.0, dt0=0.1, y0=(q, p), saveat=saveat
-        ).ys
-
-    jax.clear_caches()
+    options = {"saveat": saveat, "max_steps": 4096, "throw": True}
+    run = lambda q, p: solve(hamiltonian, solver, 0.0, 1.0, 0.1, (q, p), **options).ys
     q = jnp.array(0.5)
-    start = time.perf_counter()
-    jax.jit(solve).lower(q, q).compile()
-    return time.perf_counter() - start
+    return jax.jit(run).lower(q, q).compile()
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a short run, for CI")
-    repeats = 1 if parser.parse_args().quick else 7
+    quick = command_line(__doc__).parse_args().quick
     saveats = {
         "t1": dfx.SaveAt(t1=True),
         "ts": dfx.SaveAt(ts=jnp.linspace(0, 1, 5)),
     }
-    times = {(name, saved): [] for name in SOLVERS for saved in saveats}
-    compile_once(dfx.Tsit5(), saveats["t1"])
-    for _ in range(repeats):
-        for name, saved in times:
-            times[name, saved].append(compile_once(SOLVERS[name], saveats[saved]))
-    medians = {key: statistics.median(values) for key, values in times.items()}
-    print(f"{'':26}" + "".join(f"{f'SaveAt({s}=...)':>22}" for s in saveats))
+    calls = {
+        (name, saved): functools.partial(compiled, solver, saveat)
+        for name, solver in SOLVERS.items()
+        for saved, saveat in saveats.items()
+    }
+    calls["Tsit5, constant step", "t1"]()
+    repeats = 1 if quick else 7
+    times = interleaved(calls, repeats, warm_up=False, setup=jax.clear_caches)
+    table = Table(None, ":<25", *(f"SaveAt({saved}=...):>21" for saved in saveats))
     for name in SOLVERS:
-        row = f"{name:26}"
+        cells = []
         for saved in saveats:
-            seconds = medians[name, saved]
-            ratio = seconds / medians["Tsit5, constant step", saved]
-            row += f"{seconds:>10.2f} s {ratio:>8.2f}x"
-        print(row)
+            timing, base = times[name, saved], times["Tsit5, constant step", saved]
+            cells.append(f"{timing.median:.2f} s {timing.over(base):>8.2f}x")
+        table.row(name, *cells)
 
 
 if __name__ == "__main__":

@@ -1,25 +1,25 @@
-"""Gradients of long solves: time and memory, by four ways to get them.
+"""Gradients of long solves: time and memory of three ways to get them.
 
-The leapfrog, all in one process, compiled and warmed up, by turns, medians; on damped
-pendulums, whose sines take most of the time, and on springs with a cubic force, which
-takes next to none. A ratio is the time of value and gradient, with respect to the
-initial state and the damping, over that of the same solve alone. Beside
-`ReversibleAdjoint` stand Diffrax's `RecursiveCheckpointAdjoint`, its default, and
-reverse mode through a `lax.scan` written by hand, whose number of steps is fixed when
-it is compiled. Runs that would take too long or too much memory are left out, and those
-of minutes are made once.
+The leapfrog, on damped pendulums, whose sines take most of the time, and on springs
+with a cubic force, which takes almost none. A ratio is the time of value and gradient,
+with respect to the initial state and the damping, over that of the same solve alone.
+`ReversibleAdjoint` is compared with Diffrax's `RecursiveCheckpointAdjoint`, its
+default, and with reverse mode through a `lax.scan` written by hand, whose number of
+steps is fixed when it is compiled. Runs that would take too long or too much memory are
+omitted, and those of minutes are made once.
 
-Memory is what XLA says that the compiled program needs besides its arguments.
+Memory is what XLA reports that the compiled program needs in addition to its arguments.
 """
 
-import argparse
-import statistics
-import time
+import functools
 from typing import Any
 
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
+from _report import command_line, Table
+from _solve import last, solve
+from _timing import interleaved
 
 import diffrax_presym as dps
 
@@ -31,8 +31,7 @@ REVERSIBLE = dps.ReversibleAdjoint()
 CHECKPOINTED = dfx.RecursiveCheckpointAdjoint()
 # Steps times unknowns beyond which a method is not tried.
 MOST = {"reversible": 1e10, "checkpointed": 2e7, "scan": 3e7}
-LONG = 3e8  # beyond which a program runs once, and is its own warm-up
-
+LONG = 3e8  # Beyond which a program runs once, without a warm-up.
 
 SYSTEMS = {
     "pendulums": lambda t, q, args: -jnp.sum(jnp.cos(q)),
@@ -45,19 +44,18 @@ def by_diffrax(system, adjoint, steps):
         hamiltonian = dps.ConformalHamiltonian(
             dps.QuadraticKinetic(), SYSTEMS[system], dps.ConstantDamping(gamma)
         )
-        sol = dfx.diffeqsolve(
-            dps.HamiltonianTerm(hamiltonian),
+        sol = solve(
+            hamiltonian,
             dps.PresymplecticLeapfrog(),
-            t0=0.0,
-            t1=T1,
-            dt0=T1 / steps,
-            y0=y0,
+            0.0,
+            T1,
+            T1 / steps,
+            y0,
             adjoint=adjoint,
             max_steps=steps,
+            throw=True,
         )
-        return jnp.sum(
-            jnp.array([jnp.sum(y[-1] ** 2) for y in jax.tree.leaves(sol.ys)])
-        )
+        return sum(jnp.sum(y**2) for y in last(sol))
 
     return loss
 
@@ -101,67 +99,46 @@ def compiled(loss, n):
     return jax.jit(loss).lower(*problem(n)).compile()
 
 
-def seconds(program, inputs):
-    start = time.perf_counter()
-    jax.block_until_ready(program(*inputs))
-    return time.perf_counter() - start
-
-
 def times(system, sizes, counts, repeats):
-    names = list(MOST)
-    print(f"Value and gradient over the solve alone, {system}")
-    print(f"{'unknowns':>9} {'steps':>7} {'solve, ms':>10}", end="")
-    print("".join(f"{name:>14}" for name in names))
+    table = Table(
+        f"Value and gradient over the solve alone, {system}",
+        "unknowns:>9",
+        "steps:>7",
+        "solve, ms:>10.3g",
+        *(f"{name}:>13.2f" for name in MOST),
+    )
     for n in sizes:
-        inputs = problem(n)
         for steps in counts:
             programs = {
-                name: compiled(loss, n)
+                name: functools.partial(compiled(loss, n), *problem(n))
                 for name, loss in methods(system, steps).items()
                 if n * steps <= MOST.get(name, MOST["reversible"])
             }
             once = n * steps > LONG
-            rounds = [
-                {name: seconds(program, inputs) for name, program in programs.items()}
-                for _ in range(1 if once else repeats + 1)
-            ]
-            rounds = rounds[0 if once else 1 :]  # the first warms up
-            median = {
-                name: statistics.median(r[name] for r in rounds) for name in programs
-            }
-            row = "".join(
-                f"{median[name] / median['solve']:>14.2f}"
-                if name in median
-                else f"{'-':>14}"
-                for name in names
-            )
-            print(f"{n:>9} {steps:>7} {median['solve'] * 1e3:>10.3g}{row}", flush=True)
+            found = interleaved(programs, 1 if once else repeats, warm_up=not once)
+            alone = found["solve"]
+            ratios = [found[x].over(alone) if x in found else None for x in MOST]
+            table.row(n, steps, alone.median * 1e3, *ratios)
 
 
 def memory(n, counts):
-    print(f"Memory of value and gradient at {n} unknowns, MB")
-    print(f"{'steps':>9}" + "".join(f"{name:>14}" for name in MOST))
+    title = f"Memory of value and gradient at {n} unknowns, MB"
+    table = Table(title, "steps:>9", *(f"{name}:>13.3f" for name in MOST))
     for steps in counts:
-        row = ""
-        for name, loss in methods("pendulums", steps).items():
-            if name in MOST:
-                analysis: Any = compiled(loss, n).memory_analysis()
-                used = analysis.temp_size_in_bytes
-                row += f"{used / 1e6:>14.3f}"
-        print(f"{steps:>9}{row}", flush=True)
+        losses = methods("pendulums", steps)
+        used: list[Any] = [compiled(losses[x], n).memory_analysis() for x in MOST]
+        table.row(steps, *(analysis.temp_size_in_bytes / 1e6 for analysis in used))
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a short run, for CI")
-    quick = parser.parse_args().quick
-    print(f"{jax.devices()[0].device_kind}, median of {2 if quick else 5} runs\n")
+    quick = command_line(__doc__).parse_args().quick
+    repeats = 2 if quick else 5
+    print(f"{jax.devices()[0].device_kind}, median of {repeats} runs")
     sizes, counts = (1, 1000, 100000), (1000, 10000, 100000)
     if quick:
         sizes, counts = (1,), (1000,)
     for system in SYSTEMS:
-        times(system, sizes, counts, 2 if quick else 5)
-        print()
+        times(system, sizes, counts, repeats)
     memory(1000, (1000, 10000) if quick else (1000, 10000, 100000, 1000000))
 
 

@@ -1,4 +1,4 @@
-"""Integrators from outside the JAX world, where they are installed."""
+"""Integrators from outside JAX, where they are installed: `{name: (solve, sweep)}`."""
 
 import math
 
@@ -14,25 +14,20 @@ def scipy_runs(problem, tolerances):
     try:
         from scipy.integrate import solve_ivp
     except ImportError:
-        return []
+        return {}
     if len(problem.q0) > 100:
-        return []
+        return {}
     n = len(problem.q0)
     y0 = np.concatenate([problem.q0, problem.p0])
     rhs = lambda t, y: np.concatenate(problem.rhs(t, y[:n], y[n:]))
 
     def solve(tolerance):
-        sol = solve_ivp(
-            rhs,
-            (0, problem.t1),
-            y0,
-            "DOP853",
-            rtol=max(tolerance, 3e-14),
-            atol=tolerance,
-        )
+        rtol = max(tolerance, 3e-14)
+        ends = 0, problem.t1
+        sol = solve_ivp(rhs, ends, y0, "DOP853", rtol=rtol, atol=tolerance)
         return sol.y[:, -1].reshape(2, n)
 
-    return [("outside", "scipy DOP853", solve, list(tolerances))]
+    return {"scipy DOP853": (solve, list(tolerances))}
 
 
 def pyhamsys_runs(problem, steps):
@@ -40,15 +35,14 @@ def pyhamsys_runs(problem, steps):
     try:
         import pyhamsys  # pyright: ignore[reportMissingImports]
     except ImportError:
-        return []
+        return {}
     if len(problem.q0) > 100:
-        return []
+        return {}
     zero = np.zeros_like(problem.q0)
     velocity = lambda t, p: problem.rhs(t, problem.q0, p)[0]
     force = lambda t, q: problem.rhs(t, q, zero)[1]
 
-    # By the conventions of pyhamsys `t` is the end of the first and the start of the
-    # second, its adjoint.
+    # In pyhamsys `t` is the end of the step of `chi`, and the start of its adjoint's.
     def chi(h, t, y):
         q, p = y
         q = q + h * velocity(t, p)
@@ -71,25 +65,20 @@ def pyhamsys_runs(problem, steps):
         )
         return sol.y[..., -1]
 
-    return [
-        (
-            "outside",
-            f"pyhamsys {name}",
-            lambda n, name=name: solve(n, name),
-            list(steps),
-        )
+    return {
+        f"pyhamsys {name}": (lambda n, name=name: solve(n, name), list(steps))
         for name in ("BM4", "BM6")
-    ]
+    }
 
 
 def symplecta_runs(problem, steps):
-    """symplecta on the canonical equations, which it does by the implicit midpoint."""
+    """symplecta's implicit midpoint rule, on the canonical equations."""
     try:
         import symplecta  # pyright: ignore[reportMissingImports]
     except ImportError:
-        return []
+        return {}
     if len(problem.q0) > 2:
-        return []
+        return {}
     zero = np.zeros_like(problem.q0)
     scale = lambda t: math.exp(problem.increment(0.0, t))
 
@@ -106,7 +95,7 @@ def symplecta_runs(problem, steps):
         y = np.array([sol.q[:, -1], sol.p[:, -1] / scale(problem.t1)])
         return y if sol.success else np.full_like(y, np.nan)
 
-    return [("outside", "symplecta implicit midpoint", solve, list(steps))]
+    return {"symplecta implicit midpoint": (solve, list(steps))}
 
 
 def heyoka_runs(problem, tolerances):
@@ -114,10 +103,10 @@ def heyoka_runs(problem, tolerances):
     try:
         import heyoka as hy  # pyright: ignore[reportMissingImports]
     except ImportError:
-        return []
+        return {}
     equations = symbolic(problem, hy)
     if equations is None:
-        return []
+        return {}
     n = len(problem.q0)
     state = np.concatenate([problem.q0, problem.p0])
     compiled = {
@@ -132,7 +121,7 @@ def heyoka_runs(problem, tolerances):
         integrator.propagate_until(problem.t1)
         return integrator.state.reshape(2, n).copy()
 
-    return [("outside", "heyoka", solve, list(tolerances))]
+    return {"heyoka": (solve, list(tolerances))}
 
 
 def symbolic(problem, hy):

@@ -1,4 +1,4 @@
-"""The problems of the benchmarks, each in JAX for solving and in NumPy for checking."""
+"""The problems of the benchmarks: in JAX, and in NumPy for solvers outside of it."""
 
 import dataclasses
 import math
@@ -7,6 +7,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from _solve import reference
 
 import diffrax_presym as dps
 
@@ -15,8 +16,8 @@ import diffrax_presym as dps
 class Problem:
     name: str
     hamiltonian: dps.AbstractHamiltonian
-    # The right-hand side `rhs(t, q, p)` in NumPy, in the precision of its arguments,
-    # and the increment of the log scale from `t` to `t + h`.
+    # The right-hand side `rhs(t, q, p)` in NumPy, and the integral of the damping rate
+    # from `t` to `t + h`.
     rhs: Callable
     increment: Callable
     q0: Any
@@ -24,12 +25,19 @@ class Problem:
     t1: float
     # Whether the force is linear in the positions.
     linear: bool = False
-    # The solution at `t1`, where it is known.
+    # The solution at `t1`, where it has a closed form.
     exact: Callable | None = None
 
     @property
     def y0(self):
         return jnp.asarray(self.q0), jnp.asarray(self.p0)
+
+    def reference(self):
+        """The solution at `t1`."""
+        if self.exact is not None:
+            return self.exact()
+        q, p = reference(self.hamiltonian, self.y0, [0.0, self.t1])
+        return np.array([q[0], p[0]])
 
 
 def conformal(potential, damping, kinetic=None):
@@ -116,10 +124,10 @@ def chain(n=100):
 
     def rhs(t, q, p):
         stretch = np.diff(q)
-        pull = stretch + stretch**3
+        tension = stretch + stretch**3
         force = -q - q**3
-        force[:-1] += pull
-        force[1:] -= pull
+        force[:-1] += tension
+        force[1:] -= tension
         return p, force - gamma * p
 
     return Problem(
@@ -166,7 +174,7 @@ def random_quadratic(n=1000, m=1250):
         return np.array([modes @ (q * amplitude), modes @ (p * amplitude)])
 
     def rhs(t, q, p):
-        return p, -(hessian.astype(q.dtype) @ q) - gamma * p
+        return p, -hessian @ q - gamma * p
 
     return Problem(
         f"random quadratic, {n}",
@@ -192,50 +200,3 @@ PROBLEMS = [
     relativistic,
     random_quadratic,
 ]
-
-
-def reference(problem):
-    """The solution at `t1` to better than 1e-14."""
-    if problem.exact is not None:
-        return problem.exact()
-    steps = 4 * round(problem.t1)
-    y, change = _extrapolated(problem, steps), np.inf
-    while not change < 1e-14:
-        if steps > 100 * problem.t1:
-            raise RuntimeError(
-                f"No reference for {problem.name}: still off by {change}"
-            )
-        steps = 2 * steps
-        before, y = y, _extrapolated(problem, steps)
-        change = np.max(np.abs(y - before))
-    return y.astype(float)
-
-
-def _extrapolated(problem, steps):
-    """Gragg, Bulirsch and Stoer's extrapolation of order 16, in extended precision.
-
-    It has nothing in common with any solver that is measured here.
-    """
-    real = np.longdouble
-    t1 = real(problem.t1)
-    q, p = (np.asarray(x, real) for x in (problem.q0, problem.p0))
-    rhs = lambda t, y: np.array(problem.rhs(t, *y))
-    h = t1 / steps
-    y = np.array([q, p])
-    counts = [2 * (k + 1) for k in range(8)]
-    for i in range(steps):
-        # In terms of the change from `y`, to round it and not `y` itself.
-        table = []
-        for n in counts:
-            s = h / n
-            before, now = 0, s * rhs(i * h, y)
-            for k in range(1, n):
-                before, now = now, before + 2 * s * rhs(i * h + k * s, y + now)
-            last = rhs((i + 1) * h, y + now)
-            table.append((before + now + s * last) / 2)
-        for j in range(1, len(counts)):
-            for k in range(len(counts) - 1, j - 1, -1):
-                ratio = real(counts[k]) / counts[k - j]
-                table[k] = table[k] + (table[k] - table[k - 1]) / (ratio**2 - 1)
-        y = y + table[-1]
-    return y

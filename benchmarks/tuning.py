@@ -2,14 +2,14 @@
 
 For each Runge-Kutta-Nyström splitting it prints the longest step times frequency, per
 force evaluation, at which one step of an oscillator errs by less than 1e-3, 1e-6 and
-1e-9; and the errors of a step at degrees 3, 5 and 7 for any force, as far as they are
-left, per evaluation. Then it rounds the coefficients of `TunedRKN6` to three digits,
-and lets the optimiser find as good ones again.
+1e-9; and the remaining errors of a step at degrees 3, 5 and 7 for any force, per
+evaluation. Then it rounds the coefficients of `TunedRKN6` to three digits, and
+restarts the optimiser, which finds equally good ones.
 
 `--search linear` and `--search rkn` start from random numbers instead and print the
 best coefficients found so far. Most starts end in poor minima: the committed ones took
-some hundreds. The weights of the objective of `TunedRKN6` are those of two dozen tried
-that left about the least errors on five of the problems of `work_precision.py`.
+some hundreds. Of two dozen weights of the objective of `TunedRKN6`, those chosen gave
+about the smallest errors on five of the problems of `work_precision.py`.
 
 A step of an oscillator over z, step times frequency, is [[P, z A], [-z B, P]] with
 polynomials P, A, B in s = z^2, where P^2 + s A B = 1; and such polynomials are those of
@@ -20,7 +20,6 @@ to where the conditions of order 6 hold. These are on words in two letters, the 
 and B of drift and kick, modulo [B, [B, [B, A]]] = 0.
 """
 
-import argparse
 import itertools
 import math
 import time
@@ -29,6 +28,7 @@ import jax
 import jax.numpy as jnp
 import mpmath  # pyright: ignore[reportMissingImports]
 import numpy as np
+from _report import command_line, Table
 
 import diffrax_presym as dps
 
@@ -90,7 +90,7 @@ FLOW = jnp.array([1 / math.factorial(len(word)) for word in WORDS])
 
 
 def _modulo_nystroem(degree):
-    """What of the words of a degree is left where [B, [B, [B, A]]] is zero."""
+    """A basis of the words of a degree modulo [B, [B, [B, A]]] = 0."""
     relation = {"BBBA": 1, "BBAB": -3, "BABB": 3, "ABBB": -1}
     rows = [np.zeros(len(WORDS))]
     for before in range(degree - 3):
@@ -128,7 +128,7 @@ def words(moves, kick_first):
 
 
 def splitting(x):
-    """Kicks and drifts by turns, kicks first, that sum to one each."""
+    """Alternating kicks and drifts, kicks first, that sum to one each."""
     kicks, drifts = x[: STAGES // 2], x[STAGES // 2 :]
     middle = 1 - 2 * jnp.sum(kicks, keepdims=True)
     last = 0.5 - jnp.sum(drifts, keepdims=True)
@@ -225,7 +225,7 @@ def _taylor(one):
 class LinearProblem(Problem):
     """In terms of the polynomials P, A and B: what they are times those of cos and sin.
 
-    The coefficients that order 8 fixes are one, and left out.
+    The coefficients that order 8 fixes are one, and omitted.
     """
 
     fixed = 4
@@ -357,29 +357,24 @@ def nystroem_splittings(random):
         found = sorted(found, key=lambda pair: pair[0])[:8]
 
 
-def describe(name, moves, kick_first):
+def describe(table, name, moves, kick_first):
     each = [reach(moves, kick_first, target) for target in (1e-3, 1e-6, 1e-9)]
     errors, stages = words(moves, kick_first), len(moves) // 2
-    left = [jnp.linalg.norm(errors @ LEFT[n]) * stages ** (n - 1) for n in (3, 5, 7)]
-    shown = ["      -" if x < 1e-9 else f"{x:7.3f}" for x in left]
-    numbers = " ".join([*(f"{x:7.3f}" for x in each), *shown])
-    print(f"{name:22}{numbers}", flush=True)
+    sizes = [jnp.linalg.norm(errors @ LEFT[n]) * stages ** (n - 1) for n in (3, 5, 7)]
+    table.row(name, *each, *(float(x) if x > 1e-9 else None for x in sizes))
 
 
 def main():
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("--search", choices=["linear", "rkn"])
     parser.add_argument("--seconds", type=float, default=600)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--quick", action="store_true", help="only the table, for CI")
     options = parser.parse_args()
     titles = ("1e-3", "1e-6", "1e-9", "h^3", "h^5", "h^7")
-    print(f"{'':22}{' '.join(f'{x:>7}' for x in titles)}")
+    table = Table(None, ":<21", *(f"{title}:>7.3f" for title in titles))
     for name in SCHEMES + TUNED:
         tableau = getattr(dps, name).tableau
-        describe(name, jnp.array(tableau.fractions), tableau.kick_first)
+        describe(table, name, jnp.array(tableau.fractions), tableau.kick_first)
     if options.search is not None:
         search = {"linear": linear_splittings, "rkn": nystroem_splittings}
         random = np.random.default_rng(options.seed)
@@ -387,7 +382,7 @@ def main():
         for moves, residual in search[options.search](random):
             if residual < best:
                 best = residual
-                describe(f"found, {residual:.1e}", jnp.array(moves), True)
+                describe(table, f"found, {residual:.1e}", jnp.array(moves), True)
                 print("  ", *(f"{x:.17g}" for x in moves[: STAGES + 1]))
             if time.monotonic() - start > options.seconds:
                 break

@@ -1,0 +1,47 @@
+"""The command line of the benchmarks, and the tables that they print."""
+
+import argparse
+import re
+import sys
+
+
+def command_line(doc):
+    """A parser with the options that all benchmarks have."""
+    parser = argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--quick", action="store_true", help="a short run, for CI")
+    parser.add_argument("--markdown", action="store_true", help="tables as Markdown")
+    return parser
+
+
+class Table:
+    """A table that is printed row by row, as aligned text or as Markdown.
+
+    A column is its title and the format of its cells, as in `"error:>9.1e"`. Strings
+    are aligned only, and `None` is a dash.
+    """
+
+    def __init__(self, caption, *columns):
+        columns = [column.rpartition(":") for column in columns]
+        self.formats = [spec for _, _, spec in columns]
+        self.markdown = "--markdown" in sys.argv[1:]
+        if caption is not None:
+            print(f"\n{caption}".rstrip(" ") if caption else "")
+            if caption and self.markdown:
+                print()
+        self.row(*(title for title, _, _ in columns))
+        if self.markdown:
+            print("|" + "---|" * len(columns), flush=True)
+
+    def row(self, *cells):
+        texts = []
+        for cell, spec in zip(cells, self.formats, strict=True):
+            cell = "-" if cell is None else cell
+            if isinstance(cell, str):
+                spec = re.match(r"[<>]\d+", spec).group()  # pyright: ignore
+            texts.append(format(cell, spec))
+        if self.markdown:
+            print("| " + " | ".join(text.strip() for text in texts) + " |", flush=True)
+        else:
+            print(" ".join(texts).rstrip(), flush=True)

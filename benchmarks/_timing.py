@@ -1,0 +1,109 @@
+"""The timer of the benchmarks.
+
+Calls that are compared run interleaved in one process, after one untimed call of each
+that compiles and warms up. A time is the median over the rounds, and a ratio the median
+of the ratios of each round, so that a change of the load on the machine affects both
+sides alike.
+"""
+
+import dataclasses
+import functools
+import math
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class Timing:
+    result: Any
+    # Of each round, by the clock and summed over all cores.
+    seconds: np.ndarray
+    cpu_seconds: np.ndarray
+
+    @property
+    def median(self):
+        return float(np.median(self.seconds))
+
+    @property
+    def median_cpu(self):
+        return float(np.median(self.cpu_seconds))
+
+    def over(self, other):
+        return float(np.median(self.seconds / other.seconds))
+
+
+def timed(call):
+    """The result, the seconds, and the seconds summed over all cores."""
+    cpu, start = time.process_time(), time.perf_counter()
+    result = jax.block_until_ready(call())
+    return result, time.perf_counter() - start, time.process_time() - cpu
+
+
+def interleaved(
+    calls: Mapping[Any, Callable],
+    repeats: int,
+    *,
+    warm_up: bool = True,
+    setup: Callable = lambda: None,
+) -> dict[Any, Timing]:
+    """Times calls without arguments, each once per round.
+
+    `setup` runs before each of them, untimed.
+    """
+    if warm_up:
+        for call in calls.values():
+            jax.block_until_ready(call())
+    rounds = {key: [] for key in calls}
+    results = {}
+    for _ in range(repeats):
+        for key, call in calls.items():
+            setup()
+            results[key], *both = timed(call)
+            rounds[key].append(both)
+    return {
+        key: Timing(results[key], *np.array(both).T) for key, both in rounds.items()
+    }
+
+
+def error_curves(
+    runs: Mapping[Any, tuple[Callable, list]], error: Callable, repeats: int
+) -> dict[Any, list[tuple[float, float]]]:
+    """The points `(error, seconds)` of every run, a solve and its sweep.
+
+    `error` maps what the solve returns to a number; points that are not finite are
+    omitted.
+    """
+    errors, calls = {}, {}
+    for key, (solve, sweep) in runs.items():
+        # The first call after another function's is slow to start.
+        calls[key, None] = functools.partial(solve, sweep[0])
+        for i, x in enumerate(sweep):
+            call = functools.partial(solve, x)
+            found = float(error(jax.block_until_ready(call())))
+            if math.isfinite(found):
+                errors[key, i], calls[key, i] = found, call
+    timings = interleaved(calls, repeats, warm_up=False)
+    curves = {key: [] for key in runs}
+    for (key, i), found in errors.items():
+        curves[key].append((found, timings[key, i].median))
+    return {key: curve for key, curve in curves.items() if curve}
+
+
+def time_to(curve, target):
+    """The least time to reach an error, between the points on a log scale."""
+    best = math.inf
+    points = sorted(curve, key=lambda point: point[1])
+    for i, (error, seconds) in enumerate(points):
+        if error <= target:
+            best = min(best, seconds)
+            # The nearest less accurate point bounds the crossing from below.
+            worse = [p for p in points[:i] if p[0] > target]
+            if worse:
+                e, s = min(worse)
+                slope = math.log(seconds / s) / math.log(e / max(error, 1e-16))
+                best = min(best, s * (e / target) ** slope)
+    return best
