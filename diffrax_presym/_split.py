@@ -68,6 +68,11 @@ class KineticSplit(AbstractSplit):
     kinds: frozenset[str] = eqx.field(static=True)
 
     def __init__(self, separable: bool, nystrom: bool):
+        """**Arguments:**
+
+        - `separable`: whether the velocity depends on `p` alone, and the force on `q`.
+        - `nystrom`: whether the kinetic part is quadratic in `p`.
+        """
         names = {"any": True, "separable": separable, "nystrom": nystrom}
         self.kinds = frozenset(name for name, holds in names.items() if holds)
 
@@ -127,6 +132,11 @@ class SharedSplit(AbstractSplit):
     half: ScaledDamping | None
 
     def __init__(self, kinetic: "QuadraticKinetic", damping: AbstractDamping | None):
+        """**Arguments:**
+
+        - `kinetic`: the kinetic energy, whose mass is constant.
+        - `damping`: the damping law of the Hamiltonian, or `None`.
+        """
         self.kinetic = kinetic
         self.half = None if damping is None else ScaledDamping(damping, 0.5)
 

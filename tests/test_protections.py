@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, henon_heiles, mixed_energy, oscillator, solve, step
+from helpers import assert_close, henon_heiles, oscillator, solve, step
 
 import diffrax_presym as dps
 
@@ -177,11 +177,3 @@ def test_errors():
             wrapper(dfx.Tsit5())  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="positive"):
         dps.Compensated(BASES[1], -0.1)
-    with pytest.raises(ValueError, match="separable"):
-        step(
-            dps.Hamiltonian(mixed_energy),
-            dps.Compensated(dps.PresymplecticTao()),
-            0.0,
-            0.1,
-            Y0,
-        )

@@ -24,6 +24,7 @@ class Inputs(NamedTuple):
     start: tuple[PyTree, PyTree]  # the state, and what the solver carries besides
     parameters: tuple[System, list[Callable]]  # the system, and functions to be saved
     rest: dict[str, Any]  # all that is not differentiated
+    run: Callable  # the loop
 
 
 class Position(NamedTuple):

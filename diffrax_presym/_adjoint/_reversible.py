@@ -5,11 +5,15 @@ that the states of a solve need not be stored for its gradient: each is recomput
 the one after it, and cotangents are pulled back through the step between them.
 """
 
+from functools import partial
+
 import diffrax as dfx
 import equinox as eqx
 import equinox.internal as eqxi
+import jax
 import jax.lax as lax
 import jax.tree_util as jtu
+from jax.core import Tracer
 
 from .._closures import closure_to_pytree
 from .._misc import as_positive
@@ -87,14 +91,13 @@ class ReversibleAdjoint(dfx.AbstractAdjoint):
         )
         # What functions close over is differentiated too.
         parameters = closure_to_pytree((system, fns))
-        inputs = Inputs((y, carry), parameters, rest)
-        try:
-            out = _solve(inputs, self)
-        except Exception as e:
-            # Private to JAX, and so known by its name.
-            if type(e).__name__ != "CustomVJPException":
-                raise
-            raise ValueError(_HIDDEN) from e
+        inputs = Inputs((y, carry), parameters, rest, _forward)
+        if _holds_tracers(parameters, system.time(rest["t0"]), y):
+            # So that it can be told whether these are differentiated. A function
+            # without a closure is not looked into.
+            run = eqx.filter_closure_convert(partial(_forward), inputs)
+            inputs = inputs._replace(run=run)
+        out = _solve(inputs, self)
         # To JAX all that comes out of a custom rule has a derivative, integers too.
         out, counts = eqx.partition(out, eqx.is_inexact_array)
         return eqx.combine(out, eqxi.nondifferentiable_backward(counts))
@@ -159,6 +162,18 @@ _hamiltonian = lambda terms: terms.term.hamiltonian
 _start = lambda state: (state.y, state.solver_state, state.made_jump)
 
 
+def _holds_tracers(parameters, t, y) -> bool:
+    """Whether a function uses arrays of an outer transformation that are no leaves."""
+    arrays, static = eqx.partition((parameters, t, y), eqx.is_array)
+
+    def use_all(arrays):
+        (system, fns), t, y = eqx.combine(arrays, static)
+        used = system.slope(t, y), [fn(t, y, system.args) for fn in fns]
+        return eqx.filter(used, eqx.is_array)
+
+    return any(isinstance(x, Tracer) for x in jax.make_jaxpr(use_all)(arrays).consts)
+
+
 def _forward(inputs: Inputs):
     """Diffrax's own loop, as for a solve without gradients."""
     system, fns = inputs.parameters
@@ -182,7 +197,7 @@ def _forward(inputs: Inputs):
 
 @eqx.filter_custom_vjp
 def _solve(inputs: Inputs, adjoint: ReversibleAdjoint):
-    return _forward(inputs)
+    return inputs.run(inputs._replace(run=_forward))
 
 
 @_solve.def_fwd
@@ -194,8 +209,10 @@ def _solve_fwd(perturbed: Inputs, inputs: Inputs, adjoint: ReversibleAdjoint):
                 "solver"
             )
         )
+    if any(jtu.tree_leaves(perturbed.run)):
+        raise ValueError(_HIDDEN)
     # Not `_solve`, so that forward mode can be taken of this.
-    out = _forward(inputs)
+    out = inputs.run(inputs._replace(run=_forward))
     return out, out[0]
 
 
@@ -203,4 +220,5 @@ def _solve_fwd(perturbed: Inputs, inputs: Inputs, adjoint: ReversibleAdjoint):
 def _solve_bwd(final, cotangents, perturbed: Inputs, inputs: Inputs, adjoint):
     backward = Backward(inputs, perturbed, final, cotangents[0])
     bar, more = gradient(backward, adjoint.checkpoints, adjoint.tol)
-    return Inputs(bar, more, jtu.tree_map(lambda _: None, inputs.rest))
+    none = jtu.tree_map(lambda _: None, (inputs.rest, inputs.run))
+    return Inputs(bar, more, *none)

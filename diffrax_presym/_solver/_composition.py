@@ -37,6 +37,7 @@ class AbstractComposition(AbstractWrapper[PyTree]):
     weights: AbstractVar[Weights]
 
     def __check_init__(self):
+        super().__check_init__()
         if len(set(self.weights)) > 1:
             error = self.base.composition_error()
             if error is not None:
