@@ -165,10 +165,18 @@ def loss(law, solver, adjoint, saveat):
     return jnp.sum(sol.ys[0] ** 2) + jnp.sum(jnp.sin(sol.ys[1]))
 
 
+WITHIN = dfx.SaveAt(ts=jnp.array([0.03, 0.5, 1.0]))
+
+
 @pytest.mark.parametrize(
-    "saveat", [dfx.SaveAt(t1=True), dfx.SaveAt(ts=jnp.array([0.03, 0.5, 1.0]))]
+    "solver, saveat",
+    [
+        (INSIDE[0], WITHIN),
+        pytest.param(INSIDE[1], dfx.SaveAt(t1=True), marks=pytest.mark.slow),
+        pytest.param(INSIDE[2], WITHIN, marks=pytest.mark.slow),
+    ],
+    ids=["leapfrog", "RKN4", "RKN6"],
 )
-@pytest.mark.parametrize("solver", INSIDE, ids=lambda solver: type(solver).__name__)
 def test_gradient_from_rest(solver, saveat):
     law = dps.LogDamping(3.0)
     gradient = eqx.filter_jit(eqx.filter_grad(loss))

@@ -142,13 +142,18 @@ def test_the_adjoint_method_undoes_a_step(wrap, base):
 @pytest.mark.parametrize(
     "solver",
     [
-        dps.PresymplecticEuler(),
         dps.Checked(dps.PresymplecticEuler()),
-        dps.Compensated(dps.PresymplecticTao(5.0)),
-        dps.Checked(dps.Compensated(dps.Suzuki4())),
         dps.Suzuki4(dps.Compensated(dps.PresymplecticLeapfrog())),
+        *(
+            pytest.param(solver, marks=pytest.mark.slow)
+            for solver in (
+                dps.PresymplecticEuler(),
+                dps.Compensated(dps.PresymplecticTao(5.0)),
+                dps.Checked(dps.Compensated(dps.Suzuki4())),
+            )
+        ),
     ],
-    ids=str,
+    ids=lambda solver: type(solver).__name__,
 )
 def test_gradients_by_reversal_through_wrappers(solver):
     def loss(y0, adjoint):

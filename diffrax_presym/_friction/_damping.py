@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 from .._misc import as_parameter, as_time, cast_to, tree_add, tree_scale
 from ._base import AbstractFriction, Scalar, Time
-from ._functions import expm1, expm1_ratio, quadrature
+from ._functions import expm1, expm1_ratio, log_growth, quadrature
 
 
 class AbstractDamping(AbstractFriction):
@@ -185,9 +185,9 @@ class LogDamping(AbstractDamping):
         return cast_to(self.gamma, t) * jnp.log(t + cast_to(self.shift, t))
 
     def increment(self, t: Time, h: Time) -> Scalar:
-        singular, since, gamma = self._since(t)
-        regular = gamma * jnp.log1p(as_time(h) / since)
-        return jnp.where(singular & (h != 0), _infinite(gamma), regular)
+        t, h = as_time(t), as_time(h)
+        growth = log_growth(h, t + cast_to(self.shift, t))
+        return cast_to(self.gamma, t) * growth
 
     def rate(self, t: Time) -> Scalar:
         singular, since, gamma = self._since(t)
@@ -251,12 +251,13 @@ class MixedDamping(AbstractDamping):
         return gamma1 * jnp.log(t) + gamma2 * t**delta
 
     def increment(self, t: Time, h: Time) -> Scalar:
-        singular, t, gamma1, gamma2, delta = self._parameters(t)
-        h = as_time(h)
-        growth = jnp.log1p(h / t)
-        regular = gamma1 * growth + gamma2 * t**delta * expm1(delta * growth)
-        from_zero = _infinite(gamma1) + gamma2 * jnp.where(singular, h, 1) ** delta
-        return jnp.where(singular & (h != 0), from_zero, regular)
+        t, h = as_time(t), as_time(h)
+        singular, since, gamma1, gamma2, delta = self._parameters(t)
+        power = since**delta * expm1(delta * jnp.log1p(h / since))
+        from_zero = jnp.where(singular, h, 1) ** delta
+        return gamma1 * log_growth(h, t) + gamma2 * jnp.where(
+            singular, from_zero, power
+        )
 
     def rate(self, t: Time) -> Scalar:
         singular, t, gamma1, gamma2, delta = self._parameters(t)

@@ -40,16 +40,46 @@ def _expm1_jvp(x, dx):
     return value, (value + 1) * dx[0]
 
 
+@jax.custom_jvp
+def log_growth(h: Time, since: Time) -> Scalar:
+    """The logarithm of `(since + h) / since`; from zero on a large number.
+
+    A large number and not infinity, whose product with zero is not a number.
+    """
+    return jnp.minimum(jnp.log1p(h / since), 1e30)
+
+
+@log_growth.defjvp
+def _log_growth_jvp(x, dx):
+    (h, since), (dh, dsince) = x, dx
+    singular = since == 0
+    safe = jnp.where(singular, 1, since)
+    slope = (dh - h / safe * dsince) / jnp.where(singular, 1, since + h)
+    return log_growth(h, since), jnp.where(singular, 0, slope)
+
+
+@jax.custom_jvp
 def expm1_ratio(x: Scalar) -> Scalar:
     small = jnp.abs(x) < 0.1
-    # Each branch within its own range: derivatives beyond it would overflow.
+    return jnp.where(small, _series(x), (jnp.exp(x) - 1) / jnp.where(small, 1, x))
+
+
+@expm1_ratio.defjvp
+def _expm1_ratio_jvp(x, dx):
+    (x,), (dx,) = x, dx
+    value, small = expm1_ratio(x), jnp.abs(x) < 0.1
+    # Each branch within its own range: beyond it the derivative would overflow.
     near, far = jnp.where(small, x, 0), jnp.where(small, 1, x)
-    return jnp.where(small, _series(near), (jnp.exp(far) - 1) / far)
+    return value, jnp.where(small, _series(near, 1), (jnp.exp(far) - value) / far) * dx
 
 
-def _series(x: Scalar) -> Scalar:
+def _series(x: Scalar, derivative: int = 0) -> Scalar:
+    """The series of the ratio, or of its derivative."""
+    terms = [1 / math.factorial(k + 1) for k in range(10 + derivative)]
+    for _ in range(derivative):
+        terms = [k * c for k, c in enumerate(terms)][1:]
     # Horner's rule; `jnp.polyval` would be a loop.
-    value = 1 / math.factorial(10)
-    for k in range(9, 0, -1):
-        value = value * x + 1 / math.factorial(k)
+    value = terms[-1]
+    for c in terms[-2::-1]:
+        value = value * x + c
     return jnp.asarray(value)

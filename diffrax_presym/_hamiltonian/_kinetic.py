@@ -148,13 +148,11 @@ class RelativisticKinetic(AbstractKinetic):
                 f"one speed of light, but these have shape {rest.shape}. For several "
                 "particles write their energy as a function `T(t, p, args)`."
             )
-        unit = jnp.maximum(unit, rest)
-        # Results do not depend on it, and so neither do their derivatives. It is zero
-        # for a mass that underflows, at rest.
-        unit = lax.stop_gradient(jnp.where(unit > 0, unit, 1))
+        # Results do not depend on it, and so neither do their derivatives.
+        rest = jnp.maximum(rest, jnp.finfo(rest.dtype).tiny)
+        unit = lax.stop_gradient(jnp.maximum(unit, rest))
         p = tree_scale(1 / unit, p)
-        tiny = cast_to(jnp.finfo(unit.dtype).tiny, unit)
-        return p, tree_dot(p, p), jnp.maximum((rest / unit) ** 2, tiny), unit
+        return p, tree_dot(p, p), (rest / unit) ** 2, unit
 
     @property
     def is_quadratic(self) -> bool:
