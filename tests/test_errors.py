@@ -252,7 +252,7 @@ def test_splittings_need_a_split_energy(solver, hamiltonian):
 def test_nystroem_splittings_need_a_quadratic_kinetic_energy(solver, hamiltonian):
     with pytest.raises(ValueError) as error:
         trace(dps.HamiltonianTerm(hamiltonian), solver)
-    needed = "quadratic in the momentum, and known to be"
+    needed = "only for a quadratic kinetic energy"
     Mistake(f"`{type(solver).__name__}`", needed, "`BlanesMoan4()`").check(error)
     assert "`QuadraticKinetic(mass)`" in str(error.value)
 
@@ -275,7 +275,7 @@ ROOT_FINDER = "`root_finder` must be an Optimistix root finder"
 NEWTON = "`optimistix.Newton(rtol=1e-10, atol=1e-10)`"
 SYMMETRIC = "Compositions need a symmetric base"
 BASE = "`base` must be a presymplectic solver"
-TABLEAU = "needs drifts that sum to one and kicks that sum to one, by turns"
+TABLEAU = "alternately drifts that sum to one and kicks that sum to one"
 SUM = "`weights` must sum to one"
 FIXED = "a coupling that does not change with the step"
 WITHOUT_TOLERANCES = dfx.with_stepsize_controller_tols(dfx.VeryChord)()
@@ -290,7 +290,7 @@ SOLVERS = {
     },
     "order of a composition": (
         lambda: dps.Composition(LEAPFROG, [1.0], order=0),
-        Mistake("got 0", "must be a positive integer", "left away"),
+        Mistake("got 0", "must be a positive integer", "omitted"),
     ),
     "weights": (
         lambda: dps.Composition(LEAPFROG, [0.5, 0.25]),
@@ -376,7 +376,7 @@ SOLVERS = {
     ),
     "several couplings": (
         lambda: trace(TERM, dps.PresymplecticTao(jnp.ones(2))),
-        Mistake("has shape (2,)", "must be one number", "`jax.vmap`"),
+        Mistake("has shape (2,)", "must be a scalar", "`jax.vmap`"),
     ),
     **{
         f"first {given!r}": (
