@@ -135,7 +135,7 @@ def test_integer_states_are_for_diffeqsolve_to_convert(scheme: Scheme):
 # Terms
 
 ODE = dfx.ODETerm(lambda t, y, args: y)
-STEPPED = "Presymplectic solvers step a `HamiltonianTerm`"
+STEPPED = "Presymplectic solvers need a `HamiltonianTerm`"
 HAND_WRITTEN = "`HamiltonianTerm(VectorField(velocity, force))` for a hand-written"
 
 
@@ -401,7 +401,7 @@ SOLVERS = {
     ),
     "root finder without tolerances": (
         lambda: dps.PresymplecticEuler(root_finder=WITHOUT_TOLERANCES),
-        Mistake("`root_finder` needs", "a tolerance `rtol` of its own", NEWTON),
+        Mistake("`root_finder` needs", "needs a tolerance `rtol`", NEWTON),
     ),
     **{
         f"substeps {n!r}": (
@@ -433,12 +433,12 @@ def test_equal_weights_ask_nothing_of_the_base():
 # Hamiltonians
 
 POSITIVE = "must be positive"
-ONE_NUMBER = "must return one real number, the energy of the whole system"
+ONE_NUMBER = "must return a real scalar for the whole system"
 SUM_OVER = "`jnp.sum(...)`"
 MASS = "`QuadraticKinetic(mass)`"
 LAW = "must be a damping law or a function eta(t)"
 RATE = "`ConstantDamping(rate)`"
-ONE_DAMPING = "must be one number for the whole system"
+ONE_DAMPING = "must be a scalar for the whole system"
 EITHER = "either `kinetic` and `potential`, or `energy`"
 VECTOR = jnp.array([0.1, 0.2])
 
@@ -480,7 +480,7 @@ HAMILTONIANS = {
     ),
     "mass of a wrong structure": (
         lambda: system(dps.QuadraticKinetic({"a": 1.0})),
-        Mistake("got PyTreeDef({'a': *})", "of the structure of `p`", "one number"),
+        Mistake("got PyTreeDef({'a': *})", "of the structure of `p`", "an array"),
     ),
     "list of masses": (
         lambda: system(dps.QuadraticKinetic([1.0, 2.0])),

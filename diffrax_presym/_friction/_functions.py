@@ -1,4 +1,4 @@
-"""Functions of one number that the laws of friction are made of."""
+"""Scalar functions for damping laws."""
 
 import math
 from collections.abc import Callable
@@ -24,8 +24,8 @@ def quadrature(fn: Callable, h: Time, order: int) -> Scalar:
     return jnp.sum(weights * cast_to(jax.vmap(fn)(nodes), h))
 
 
-# exp(x) - 1 and its ratio to x, to rounding and with their derivatives, through zero.
-# XLA's own expm1 takes longer than all else in a leapfrog step of one unknown.
+# exp(x) - 1 and its ratio to x, accurate to rounding near zero, with derivatives. XLA's
+# own expm1 takes longer than the rest of a leapfrog step of one unknown.
 
 
 @jax.custom_jvp
@@ -42,7 +42,7 @@ def _expm1_jvp(x, dx):
 
 def expm1_ratio(x: Scalar) -> Scalar:
     small = jnp.abs(x) < 0.1
-    # Each branch within its own range: derivatives beyond it would overflow.
+    # Each branch is evaluated within its range: outside, derivatives would overflow.
     near, far = jnp.where(small, x, 0), jnp.where(small, 1, x)
     return jnp.where(small, _series(near), (jnp.exp(far) - 1) / far)
 
