@@ -70,9 +70,9 @@ def apply_form(form, x: PyTree, name: str, state: str, leaf: Callable, operator)
         return jtu.tree_map(lambda xi: one(xi, form), x)
     if jtu.tree_structure(form) != jtu.tree_structure(x):
         raise ValueError(
-            f"{name} must be an array or a pytree of the structure of `{state}`, "
-            f"{jtu.tree_structure(x)}, but got {jtu.tree_structure(form)}. Convert a "
-            "list of numbers with `jnp.array(...)`."
+            f"{name} must be a number, an array or a pytree of the structure of "
+            f"`{state}`, {jtu.tree_structure(x)}, but got {jtu.tree_structure(form)}. "
+            "Convert a list of numbers with `jnp.array(...)`."
         )
     return jtu.tree_map(one, x, form)
 
