@@ -1,4 +1,4 @@
-"""Arrays that Python functions hold, as leaves of a pytree."""
+"""Arrays held by Python functions, as leaves of a pytree."""
 
 import functools
 import inspect
@@ -12,18 +12,18 @@ from jaxtyping import PyTree
 
 
 def closure_to_pytree(tree: PyTree) -> PyTree:
-    """The same, but every array that a function in it holds is a leaf of it.
+    """The same tree, with every array held by one of its functions as a leaf.
 
-    A custom rule for derivatives needs that. `equinox.filter_closure_convert` would
-    need to know with what each function will be called. Seen are closures, defaults,
-    partial and bound arguments, and attributes; through `jax.jit`, `jax.checkpoint` and
-    other wrappers.
+    Custom derivative rules need this. `equinox.filter_closure_convert` would need the
+    arguments of each function. Supports closures, defaults, partial and bound
+    arguments, and attributes, also within `jax.jit`, `jax.checkpoint` and other
+    wrappers.
     """
     return jtu.tree_map(lambda x: _convert(x, ()) if callable(x) else x, tree)
 
 
 class _Parts(eqx.Module):
-    """A Python object, taken apart: what it is made of, and how."""
+    """A Python object as a pytree of its parts, from which it can be rebuilt."""
 
     kind: Any = eqx.field(static=True)
     original: Any = eqx.field(static=True)
@@ -70,9 +70,9 @@ _PLAIN = (type, ModuleType, str, bytes, int, float, complex)
 
 
 def _convert(x, within: tuple):
-    # Within a solve it is compiled anyway.
+    # A solve is compiled anyway, so `jax.jit` can be removed.
     x = inspect.unwrap(x, stop=lambda x: not isinstance(x, _JITTED))
-    # What holds itself is not taken apart: there is no end to it.
+    # Objects that contain themselves would cause an infinite recursion.
     if any(x is y for y in within):
         return x
     taken = _take_apart(x)
@@ -80,7 +80,7 @@ def _convert(x, within: tuple):
         return x
     kind, parts = taken
     parts = jtu.tree_map(lambda leaf: _convert(leaf, (*within, x)), parts)
-    # A function is equal to itself alone, so it stays itself where it can.
+    # Functions compare by identity, so those without arrays are kept.
     found = any(map(eqx.is_array, jtu.tree_leaves(parts)))
     return _Parts(kind, x, parts) if found else x
 
@@ -93,7 +93,7 @@ def _take_apart(x) -> tuple[str, PyTree] | None:
     if isinstance(x, FunctionType):
         try:
             cells = [cell.cell_contents for cell in x.__closure__ or ()]
-        except ValueError:  # not yet filled
+        except ValueError:  # empty cell
             return None
         return "function", (cells, x.__defaults__, x.__kwdefaults__, vars(x))
     if eqx.is_array_like(x) or isinstance(x, _PLAIN) or not hasattr(x, "__dict__"):

@@ -7,18 +7,17 @@ from ._misc import cast_to
 
 
 class HermiteInterpolation(dfx.AbstractLocalInterpolation):
-    """Hermite interpolation of a step from what is known at its two ends.
+    """Hermite interpolation of a step from values and derivatives at its two ends.
 
-    Exact at both ends. Cubic from the slopes there, with an error of fourth order in
-    the step; quintic where the second derivatives are given too, with an error of
-    sixth order.
+    Exact at both ends. Cubic from first derivatives, with an error of fourth order in
+    the step; quintic if second derivatives are given too, with an error of sixth order.
     """
 
     t0: PyTree
     t1: PyTree
     y0: PyTree
     y1: PyTree
-    # Slopes and second derivatives, times the length of the step and its square.
+    # First and second derivatives, times the step size and its square.
     k0: PyTree
     k1: PyTree
     b0: PyTree = None
@@ -29,7 +28,7 @@ class HermiteInterpolation(dfx.AbstractLocalInterpolation):
         if t1 is not None:
             start, end = self.evaluate(t0), self.evaluate(t1)
             return jtu.tree_map(lambda a, b: b - a, start, end)
-        # A step of no length, as in an empty solve, is all start.
+        # A step of zero length, as in an empty solve, evaluates to its start.
         length = self.t1 - self.t0
         empty = length == 0
         s = jnp.where(empty, 0, (t0 - self.t0) / jnp.where(empty, 1, length))
@@ -44,7 +43,7 @@ def _hermite(s, y0, y1, k0, k1, b0=None, b1=None):
     y = r * y0 + s * y1 - s * r * ((r - s) * jump - r * k0 + s * k1)
     if b0 is None:
         return y
-    # What the cubic misses of the second derivatives.
+    # The errors of the second derivatives of the cubic.
     miss0 = b0 - (6 * jump - 4 * k0 - 2 * k1)
     miss1 = b1 - (2 * k0 + 4 * k1 - 6 * jump)
     return y + (s * r) ** 2 * (r * miss0 + s * miss1) / 2

@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact, PyTree
 
 
 def as_parameter(x, name: str) -> Inexact[Array, "..."]:
-    """A user's number as a leaf that `jax.grad` and `eqx.filter_grad` reach."""
+    """A user's number as a leaf for `jax.grad` and `eqx.filter_grad`."""
     if not eqx.is_array_like(x):
         raise ValueError(f"{name} must be a real number, but got {x!r}.")
     if jnp.issubdtype(jnp.result_type(x), jnp.complexfloating):
@@ -21,7 +21,7 @@ def as_parameter(x, name: str) -> Inexact[Array, "..."]:
 
 
 def as_positive(x, name: str, instead: str = "") -> Inexact[Array, "..."]:
-    """As `as_parameter`, and positive, unless the value is not known yet."""
+    """As `as_parameter`, and checked to be positive unless it is traced."""
     x = as_parameter(x, name)
     if not isinstance(x, Tracer) and not bool(jnp.all(x > 0)):
         raise ValueError(f"{name} must be positive, but got {x}.{instead}")
@@ -31,7 +31,7 @@ def as_positive(x, name: str, instead: str = "") -> Inexact[Array, "..."]:
 def cast_to(x: ArrayLike, like: ArrayLike) -> Array:
     """`x` in the precision of `like`: a parameter never upcasts time or state.
 
-    Nor does an integer, such as a time of `10`, truncate it.
+    An integer, such as a time of `10`, does not truncate it.
     """
     dtype = jnp.result_type(like)
     return jnp.asarray(x, dtype if jnp.issubdtype(dtype, jnp.inexact) else None)
@@ -45,7 +45,7 @@ def as_time(t: ArrayLike) -> Array:
 
 
 class Sum(eqx.Module):
-    """A number with compensated summation: it stands for `value + lost`.
+    """A number with compensated summation, equal to `value + lost`.
 
     `lost` is the rounding error of the additions so far.
     """
@@ -54,7 +54,7 @@ class Sum(eqx.Module):
     lost: Array
 
     def __add__(self, x: Array) -> "Sum":
-        # Exact whichever of the two is larger (Møller, Knuth).
+        # Exact, whichever of the two is larger (Møller, Knuth).
         x = x + self.lost
         value = self.value + x
         taken = value - self.value
@@ -69,7 +69,7 @@ _is_sum = lambda x: isinstance(x, Sum)
 
 
 def values(x: _T) -> _T:
-    """The numbers of a state, without what compensated summation holds besides."""
+    """The arrays of a state, without the errors kept by compensated summation."""
     return jtu.tree_map(lambda x: x.value if _is_sum(x) else x, x, is_leaf=_is_sum)
 
 
@@ -90,7 +90,7 @@ def tree_sub(x: PyTree, y: PyTree) -> PyTree:
 
 
 def tree_scale(c: ArrayLike | None, y: PyTree) -> PyTree:
-    """`c * y`, each leaf in its own precision; no operation at all for `None`."""
+    """`c * y`, each leaf in its own precision; `y` if `c` is `None`."""
     if c is None:
         return y
     return jtu.tree_map(lambda yi: cast_to(c, yi) * yi, y)
@@ -110,7 +110,7 @@ def all_finite(x: PyTree) -> Bool[Array, ""]:
 
 
 def describe(tree: PyTree) -> str:
-    """A pytree by the precisions and shapes of its leaves, for errors."""
+    """The precisions and shapes of the leaves of a pytree, for errors."""
     leaf = lambda x: f"{jnp.result_type(x)}{list(jnp.shape(x))}"
     return str(jtu.tree_map(leaf, tree)).replace("'", "")
 
@@ -125,13 +125,13 @@ def check_root_finder(root_finder) -> None:
     for name in ("rtol", "atol"):
         if not eqx.is_array_like(getattr(root_finder, name, 0.0)):
             raise ValueError(
-                f"`root_finder` needs a tolerance `{name}` of its own. Write for "
-                "example `optimistix.Newton(rtol=1e-10, atol=1e-10)`."
+                f"`root_finder` needs a tolerance `{name}`. Write for example "
+                "`optimistix.Newton(rtol=1e-10, atol=1e-10)`."
             )
 
 
 def scalar_fn(fn, name: str):
-    """`fn`, with a clear error should it return anything but one real number."""
+    """`fn`, with an error if it does not return a real scalar."""
 
     def checked(*args):
         out = fn(*args)
@@ -139,12 +139,12 @@ def scalar_fn(fn, name: str):
         if len(leaves) != 1 or jnp.shape(leaves[0]) != ():
             instead = "Sum over the degrees of freedom, for example `jnp.sum(...)`."
         elif not jnp.issubdtype(jnp.result_type(leaves[0]), jnp.floating):
-            instead = "Convert it to floating point, a complex number by `jnp.real`."
+            instead = "Convert it to floating point, a complex number with `jnp.real`."
         else:
             return leaves[0]
         raise ValueError(
-            f"{name} must return one real number, the energy of the whole system, but "
-            f"returned {describe(out)}. {instead}"
+            f"{name} must return a real scalar for the whole system, but returned "
+            f"{describe(out)}. {instead}"
         )
 
     return checked
@@ -162,8 +162,8 @@ def match(value: PyTree, like: PyTree, name: str, like_name: str) -> PyTree:
         # A cast would drop the imaginary part.
         if jnp.issubdtype(jnp.result_type(v), jnp.complexfloating):
             raise ValueError(
-                f"{name} must return real arrays, but returned {describe(v)}. Take "
-                "`jnp.real` of it if that is what is meant."
+                f"{name} must return real arrays, but returned {describe(v)}. Use "
+                "`jnp.real` if the real part is meant."
             )
         try:
             return jnp.broadcast_to(cast_to(v, x), jnp.shape(x))

@@ -1,4 +1,4 @@
-"""A loop over the stages of a step, without what does not belong in it."""
+"""A loop over the stages of a step, without what can be precomputed."""
 
 import functools
 from collections.abc import Callable
@@ -12,16 +12,17 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jaxtyping import PyTree
 
 
-# Entries of the loop's state from which on a table costs less than it saves, measured.
+# Size of the loop's state from which precomputing pays off, as measured.
 _MANY = 16
 
 
 def scan_stages(stage: Callable, init: PyTree, moves: PyTree, reverse: bool = False):
-    """`jax.lax.scan`, but numbers that depend on `moves` alone, and not on the state,
-    are computed beforehand, for all stages at once.
+    """`jax.lax.scan`, with numbers that depend only on `moves` precomputed for all
+    stages at once.
 
-    These are all that damping and the time have to say. Within the loop each would be a
-    kernel of its own on a CPU, and they are many more than those that move the state.
+    These are the numbers that depend on damping and time. In the loop each would be a
+    separate kernel on a CPU, and there are many more of them than kernels that update
+    the state.
     """
     if sum(jnp.size(x) for x in jtu.tree_leaves(init)) < _MANY:
         return lax.scan(stage, init, moves, reverse=reverse)
@@ -33,7 +34,7 @@ def scan_stages(stage: Callable, init: PyTree, moves: PyTree, reverse: bool = Fa
     known, before, within = {*jaxpr.constvars, *of_moves}, [], []
     for eqn in jaxpr.eqns:
         early = known.issuperset(_variables(eqn.invars)) and not eqn.effects
-        # A callback need not know what to do with all stages at once.
+        # A callback may not support all stages at once.
         alone = any(e.primitive.name == "pure_callback" for e in equations([eqn]))
         if early and not alone and all(x.aval.size < _MANY for x in eqn.outvars):
             before.append(eqn)
@@ -65,7 +66,7 @@ def _variables(atoms) -> list:
 
 
 def equations(eqns):
-    """All of these equations, and those within their loops, branches and calls."""
+    """All of these equations, including those in loops, branches and calls."""
     for eqn in eqns:
         yield eqn
         for inner in jtu.tree_leaves(eqn.params):

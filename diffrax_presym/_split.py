@@ -1,15 +1,15 @@
-"""Splits: the pairs of exact moves that the motion of a system may be made of.
+"""Splits: the pairs of exact flows into which the motion of a system splits.
 
-A Hamiltonian offers those that its energy allows, and a scheme asks for one by kind:
+A Hamiltonian lists the splits that its energy allows, and a scheme needs one by kind:
 
-- `"separable"`: neither does the velocity depend on `q`, nor the force on `p`;
+- `"separable"`: the velocity does not depend on `q`, and the force not on `p`;
 - `"any"`: a drift, which is the exact flow of one part, and a kick by the other;
-- `"nystrom"`: as any, and the part that flows is quadratic, so that the commutator
-  [kick, [kick, [kick, drift]]] vanishes (Runge--Kutta--Nyström methods rely on it);
+- `"nystrom"`: as any, and the part that drifts is quadratic, so that the commutator
+  [kick, [kick, [kick, drift]]] vanishes, as Runge--Kutta--Nyström methods require;
 - `"shared"`: a second-order equation, with the friction turned into a force.
 
-The moves act on a pair of variables, mostly `(q, p)`: a drift takes time along, and a
-kick adds to the second of the pair.
+Both act on a pair of variables, usually `(q, p)`: a drift advances time, and a kick
+adds to the second of the pair.
 """
 
 import abc
@@ -38,7 +38,7 @@ State: TypeAlias = tuple[PyTree[Inexact[Array, "..."]], PyTree[Inexact[Array, ".
 
 
 class AbstractSplit(eqx.Module):
-    """Two exact moves, in variables of their own."""
+    """A pair of exact flows, and the variables in which they act."""
 
     kinds: AbstractVar[frozenset[str]]
 
@@ -54,7 +54,7 @@ class AbstractSplit(eqx.Module):
     def drift(self, system: "System", t: Time, h: Time, z: State, order: int) -> State:
         """The flow of one part from `t` to `t + h`, friction included.
 
-        Exact where it is known in closed form, and else to the given order in `h`.
+        Exact if known in closed form, otherwise of the given order in `h`.
         """
 
     @abc.abstractmethod
@@ -63,7 +63,7 @@ class AbstractSplit(eqx.Module):
 
 
 class KineticSplit(AbstractSplit):
-    """The drift is the flow of the kinetic part, and the potential kicks."""
+    """The drift is the flow of the kinetic part, and the kick that of the potential."""
 
     kinds: frozenset[str] = eqx.field(static=True)
 
@@ -90,10 +90,8 @@ class KineticSplit(AbstractSplit):
 
 
 class PotentialSplit(AbstractSplit):
-    """The drift is the flow of a quadratic potential, and the velocity kicks `q`.
-
-    Positions and momenta in swapped roles.
-    """
+    """The drift is the flow of a quadratic potential, and the kick that of the
+    kinetic energy: positions and momenta in swapped roles."""
 
     @property
     def kinds(self) -> frozenset[str]:
@@ -121,7 +119,7 @@ class PotentialSplit(AbstractSplit):
 
 
 class SharedSplit(AbstractSplit):
-    r"""Half of the friction on positions and half on momenta, of which a force is left.
+    r"""Half of the friction on positions and half on momenta, which leaves a force.
 
     With $q = e^{-\eta / 2} x$ the motion is
     $M x'' = e^{\eta / 2} F + (\eta'^2 / 4 + \eta'' / 2) M x$. The pair is $q$ and

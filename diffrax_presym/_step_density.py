@@ -15,11 +15,11 @@ Scalar = Inexact[Array, ""]
 
 
 class DistanceDensity(eqx.Module):
-    r"""Steps by distance, $\sigma = \big( \sum_k r_k^{-2s} \big)^{-1/2}$.
+    r"""The step density of distances, $\sigma = \big( \sum_k r_k^{-2s} \big)^{-1/2}$.
 
-    With one distance this is $\sigma = r^s$. For attraction that grows without bound as
-    bodies approach each other: with $s = 3/2$, by Kepler's third law, a close encounter
-    takes as many steps as a distant one. It takes no force evaluation.
+    For one distance this is $\sigma = r^s$. For attraction that is unbounded as bodies
+    approach each other: with $s = 3/2$, by Kepler's third law, a close encounter takes
+    as many steps as a distant one. It needs no force evaluation.
     """
 
     power: Scalar
@@ -29,10 +29,9 @@ class DistanceDensity(eqx.Module):
         r"""**Arguments:**
 
         - `power`: the exponent $s$, a positive number. Defaults to 3/2.
-        - `distances`: a function `distances(q)` that returns an array of all distances
-            that matter. Defaults to that from the origin, over the last axis of `q`.
-            For bodies that attract each other it is that of all pairs,
-            [`diffrax_presym.pair_distances`][].
+        - `distances`: a function `distances(q)` that returns an array of all relevant
+            distances. Defaults to that from the origin, over the last axis of `q`. For
+            bodies that attract each other use [`diffrax_presym.pair_distances`][].
 
         **Raises:**
 
@@ -68,11 +67,11 @@ def pair_distances(q: Inexact[Array, "bodies space"]) -> Inexact[Array, " pairs"
 
 
 class ArclengthDensity(eqx.Module):
-    r"""Steps of equal length in phase space, $\sigma = |(\dot q, \dot p)|^{-1}$.
+    r"""The step density of arclength, $\sigma = |(\dot q, \dot p)|^{-1}$.
 
-    For motion that is slow here and fast there, without any knowledge of where; `q` and
-    `p` should be of similar size. It takes one force evaluation per step, and its
-    derivative along the motion.
+    Steps have equal length in phase space. For motion of uneven speed, without
+    knowledge of where it is fast; `q` and `p` should be of similar size. It costs one
+    force evaluation per step, and its derivative along the motion.
     """
 
     term: HamiltonianTerm
@@ -84,7 +83,7 @@ class ArclengthDensity(eqx.Module):
 
         **Raises:**
 
-        `ValueError` if the term is no [`diffrax_presym.HamiltonianTerm`][].
+        `ValueError` if the term is not a [`diffrax_presym.HamiltonianTerm`][].
         """
         self.term = _as_term(term, "ArclengthDensity")
 
@@ -94,23 +93,22 @@ class ArclengthDensity(eqx.Module):
 
 
 class StepDensityController(dfx.AbstractStepSizeController):
-    r"""Steps by the state, $h \approx \epsilon \sigma(t, y)$, that are reversible.
+    r"""Reversible variable steps, $h \approx \epsilon \sigma(t, y)$.
 
-    A step that is chosen by an error estimate destroys what a symmetric scheme is for:
-    its energy error grows with time again. Here the logarithm of the step is integrated
-    along with the motion,
+    With steps chosen by an error estimate, the energy error of a symmetric scheme grows
+    with time. Here the logarithm of the step is integrated along with the motion,
 
     $$z_{n+1/2} = z_{n-1/2} - \epsilon \sigma \frac{\mathrm d}{\mathrm dt} \log \sigma,
     \qquad h_{n+1/2} = \epsilon e^{-z_{n+1/2}},$$
 
-    with $\sigma$ and its derivative along the motion taken at step $n$, half of it in
-    the first step from $z_0 = -\log \sigma(t_0, y_0)$. A solve that is run backwards
-    from its end then takes the same steps, and energy errors stay bounded as with
-    constant steps. No step is ever rejected, and none is negative.
+    with $\sigma$ and its derivative along the motion at step $n$; the first change,
+    from $z_0 = -\log \sigma(t_0, y_0)$, is half of it. A solve backwards from its end
+    then takes the same steps, and energy errors stay bounded as with constant steps.
+    Steps are never rejected and never negative.
 
-    For motion that is very uneven, such as close encounters; with every symmetric
-    scheme of this package and with any solver of Diffrax. Not for a smooth motion,
-    where constant steps are cheaper. Works with `dt0=None` alone; a solve fails with
+    For very uneven motion, such as close encounters; with every symmetric scheme of
+    this package and any solver of Diffrax. Not for smooth motion, where constant steps
+    are cheaper. Requires `dt0=None`; a solve fails with
     `RESULTS.dt_min_reached` if a step vanishes or is not finite.
 
     ??? cite "Reference"
@@ -136,19 +134,18 @@ class StepDensityController(dfx.AbstractStepSizeController):
     def __init__(self, term: HamiltonianTerm, epsilon: ArrayLike, density: Callable):
         r"""**Arguments:**
 
-        - `term`: the term of the solve, of which the derivative along the motion is
-            taken.
+        - `term`: the term of the solve, for the derivative along the motion.
         - `epsilon`: the step size $\epsilon$ where the density is one; a positive
             number, in units of time if the density has none.
         - `density`: the step density $\sigma$, a function `density(t, y, args)` that
-            returns one positive number; for example
+            returns a positive scalar; for example
             [`diffrax_presym.DistanceDensity`][].
 
         **Raises:**
 
-        `ValueError` if `epsilon` is known not to be positive, if the term is no
+        `ValueError` if `epsilon` is known not to be positive, if the term is not a
         [`diffrax_presym.HamiltonianTerm`][], and when the solve is traced if `dt0` is
-        given or the density is no number.
+        given or the density is not a scalar.
         """
         self.term = _as_term(term, "StepDensityController")
         self.epsilon = as_positive(epsilon, "`StepDensityController(epsilon=...)`")
@@ -167,7 +164,7 @@ class StepDensityController(dfx.AbstractStepSizeController):
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         if dt0 is not None:
             raise ValueError(
-                "`StepDensityController` chooses the first step too. Write "
+                "`StepDensityController` also chooses the first step. Write "
                 "`diffeqsolve(..., dt0=None)`, and scale all steps by its `epsilon`."
             )
         log_density, change = self._density(t0, y0, args)
@@ -189,7 +186,7 @@ class StepDensityController(dfx.AbstractStepSizeController):
     def step_size(self, controller_state):
         """The size of the next step.
 
-        To continue a solve pass it as `dt0`, beside its `controller_state`.
+        To continue a solve pass it as `dt0`, along with the `controller_state`.
 
         **Arguments:**
 
@@ -200,7 +197,7 @@ class StepDensityController(dfx.AbstractStepSizeController):
         return cast_to(self.epsilon, z) * jnp.exp(-z)
 
     def reverse(self, t, y, args, controller_state):
-        """The `controller_state` with which a solve goes back the way it came.
+        """The `controller_state` for a solve back along the same steps.
 
         **Arguments:**
 
@@ -212,15 +209,15 @@ class StepDensityController(dfx.AbstractStepSizeController):
         return controller_state - self._density(t, y, args)[1]
 
     def _density(self, t, y, args):
-        r"""$\log \sigma$, and by how much $z$ changes in a step."""
+        r"""$\log \sigma$, and the change of $z$ per step."""
         t = jnp.asarray(t)
 
         def log_density(t, y):
             sigma = self.density(self.direction * t, y, args)
             if jnp.shape(sigma) != () or not jnp.isrealobj(sigma):
                 raise ValueError(
-                    "The density of `StepDensityController` must return one real "
-                    f"number, but returned {describe(sigma)}. Write for example "
+                    "The density of `StepDensityController` must return a real scalar, "
+                    f"but returned {describe(sigma)}. Write for example "
                     "`lambda t, y, args: jnp.linalg.norm(y[0]) ** 1.5`."
                 )
             return jnp.log(cast_to(sigma, t))
@@ -236,11 +233,11 @@ def power_grid(t0: ArrayLike, t1: ArrayLike, steps: int, power: ArrayLike) -> Ar
 
     For motion whose frequency is a power of time, such as Bregman dynamics with
     [`diffrax_presym.PolynomialScaling`][]: there it grows like $t^{c/2-1}$, and the
-    power $k = 2/c$ makes as many steps in every period. A grid is reversible.
+    power $k = 2/c$ makes equally many steps per period. Such steps are reversible.
 
     **Arguments:**
 
-    - `t0`, `t1`: the first and the last time, not negative.
+    - `t0`, `t1`: the first and the last time, nonnegative.
     - `steps`: the number of steps, a positive integer.
     - `power`: the power $k$, a positive number.
 
@@ -262,11 +259,11 @@ def power_grid(t0: ArrayLike, t1: ArrayLike, steps: int, power: ArrayLike) -> Ar
     for t in (t0, t1):
         if not isinstance(t, Tracer) and t < 0:
             raise ValueError(
-                f"`power_grid` needs times that are not negative, but got {t}. Powers "
-                "of negative times are not real."
+                f"`power_grid` needs nonnegative times, but got {t}. Powers of "
+                "negative times are not real."
             )
     tau = jnp.linspace(t0 ** (1 / power), t1 ** (1 / power), steps + 1)
-    # The ends themselves, whatever the rounding.
+    # The exact ends, without rounding.
     return (tau**power).at[jnp.array([0, -1])].set(jnp.stack([t0, t1]))
 
 

@@ -1,4 +1,4 @@
-"""What a solver sees of a term."""
+"""The interface between solvers and terms."""
 
 from typing import Any, TypeVar
 
@@ -17,17 +17,16 @@ from ._split import AbstractSplit, State
 
 
 _T = TypeVar("_T")
-# Also the closest there is to say of a state at which the energy is not defined. Older
-# versions of Optimistix have no word for it.
+# Also the result where the energy is not defined. Older versions of Optimistix lack it.
 NONFINITE: Any = getattr(dfx.RESULTS, "nonfinite", dfx.RESULTS.nonlinear_divergence)
 
 
 class System(eqx.Module):
-    """What a solver sees of a term, in physical time.
+    """A term as solvers use it, in physical time.
 
-    States are pairs `(q, p)`, whose leaves are arrays or, with compensated summation,
-    numbers of two parts. So `add` is the only way to update a state, and `values` reads
-    it; the other methods take states of either kind.
+    The leaves of a state `(q, p)` are arrays or, with compensated summation, `Sum`s. So
+    states are updated with `add` and read with `values`; the other methods take states
+    of either kind.
     """
 
     hamiltonian: AbstractHamiltonian
@@ -64,7 +63,7 @@ class System(eqx.Module):
         return self.hamiltonian.damping
 
     def velocity(self, t: Time, y: State) -> PyTree:
-        """The velocity, all of the change of `q`."""
+        """The velocity, which is the derivative of `q`."""
         return self.hamiltonian.velocity(t, *values(y), self.args)
 
     def force(self, t: Time, y: State) -> PyTree:
@@ -73,7 +72,7 @@ class System(eqx.Module):
         return _stored(self.hamiltonian.force(t, *y, self.args), t, y)
 
     def slope(self, t: Time, y: State, force: PyTree | None = None) -> State:
-        """The full vector field, friction included. The force may be known already."""
+        """The full vector field, friction included; `force` may be given."""
         y = values(y)
         force = self.force(t, y) if force is None else force
         if self.friction is not None:
@@ -81,12 +80,12 @@ class System(eqx.Module):
         return self.velocity(t, y), force
 
     def second_derivative(self, t: Time, y: State, slope: State) -> State:
-        """The derivative of the slope along the motion."""
+        """The derivative of the vector field along the motion."""
         y = values(y)
         return jax.jvp(self.slope, (t, y), (jnp.ones_like(t), slope))[1]
 
     def check(self, t: Time, y: State) -> dfx.RESULTS | None:
-        """A failure where the energy is not defined; `None` if it is everywhere."""
+        """A failure where the energy is not defined; `None` if that is not checked."""
         valid = self.hamiltonian.is_valid(t, *values(y), self.args)
         if valid is None:
             return None
@@ -108,7 +107,7 @@ class System(eqx.Module):
         return tree_add(q, 1, dq), p if dp is None else tree_add(p, 1, dp)
 
     def potential_force(self, t: Time, y: State) -> PyTree:
-        """The force that is left to a kick if the kinetic part drifts."""
+        """The force of a kick, without that of the kinetic part."""
         y = values(y)
         return _stored(self.hamiltonian.potential_force(t, *y, self.args), t, y)
 
@@ -124,8 +123,8 @@ class System(eqx.Module):
 
 
 def _stored(force: PyTree, t: Time, y: State) -> PyTree:
-    # Selecting between two arrays, although always the first, makes XLA store the
-    # force. It would rather recompute an elementwise force wherever it is used.
+    # A selection, which always gives the force, makes XLA store it. Otherwise XLA
+    # recomputes an elementwise force wherever it is used.
     return jtu.tree_map(lambda f, q: jnp.where(t == t, f, q), force, y[0])
 
 

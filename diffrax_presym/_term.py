@@ -7,7 +7,7 @@ from ._split import State
 from ._system import check_state, System
 
 
-# Of Hamiltonians written for earlier versions.
+# Methods of Hamiltonians written for earlier versions, and what to write instead.
 _SPLITS = (
     "Write the property `splits`: `(KineticSplit(separable=..., nystrom=...),)` if the "
     "flow of the kinetic part is known, and `()` otherwise."
@@ -29,10 +29,9 @@ class HamiltonianTerm(dfx.AbstractTerm):
     The state is a pair `(q, p)` of pytrees of one structure, the positions and the
     *mechanical* momenta (see [`diffrax_presym.AbstractHamiltonian`][]).
 
-    The solvers of this package ask the term for velocity, force and frame. Any other
-    Diffrax solver for ordinary differential equations accepts it too, and is given the
-    full vector field $(\partial E/\partial p, -\partial E/\partial q - \eta'(t) \, p)$.
-    Comparing the two is changing one word.
+    The solvers of this package use the velocity, force and frame of the term. Any other
+    Diffrax solver for ordinary differential equations accepts it too, and uses the full
+    vector field $(\partial E/\partial p, -\partial E/\partial q - \eta'(t) \, p)$.
 
     !!! example
 
@@ -71,7 +70,7 @@ class HamiltonianTerm(dfx.AbstractTerm):
         for name, instead in _RENAMED.items():
             if hasattr(type(hamiltonian), name):
                 raise ValueError(
-                    f"`{type(hamiltonian).__name__}.{name}` is no longer asked for. "
+                    f"`{type(hamiltonian).__name__}.{name}` is no longer used. "
                     f"{instead}"
                 )
         self.hamiltonian = hamiltonian
@@ -88,10 +87,10 @@ class HamiltonianTerm(dfx.AbstractTerm):
 
 
 def as_system(terms: PyTree, args: PyTree) -> System:
-    """The system of the term that `diffeqsolve` hands to a solver."""
+    """The system of the term that `diffeqsolve` passes to a solver."""
     term, direction = terms, 1
-    # Diffrax wraps a term to solve backwards in time. Its wrapper is private, so it is
-    # known here by its two attributes.
+    # Diffrax wraps a term to solve backwards in time. The wrapper is private, so it is
+    # recognised by its two attributes.
     if hasattr(term, "term") and hasattr(term, "direction"):
         term, direction = term.term, term.direction
     if isinstance(term, HamiltonianTerm):
@@ -104,7 +103,7 @@ def as_system(terms: PyTree, args: PyTree) -> System:
             "`RecursiveCheckpointAdjoint()`."
         )
     raise ValueError(
-        "Presymplectic solvers step a `HamiltonianTerm`, but got "
+        "Presymplectic solvers need a `HamiltonianTerm`, but got "
         f"`{type(term).__name__}`. Write `HamiltonianTerm(hamiltonian)`, or "
         "`HamiltonianTerm(VectorField(velocity, force))` for a hand-written vector "
         "field."

@@ -1,4 +1,4 @@
-"""What a solution is worth: energy, structure and order, measured."""
+"""Measures of the energy, structure and order of a solution."""
 
 import diffrax as dfx
 import equinox as eqx
@@ -19,7 +19,7 @@ Times = Inexact[Array, " times"]
 
 
 def energy(term: HamiltonianTerm, ts: Times, ys: State, args: PyTree = None) -> Times:
-    r"""The mechanical energy $E(t, q, p)$ at each of the times that were saved.
+    r"""The mechanical energy $E(t, q, p)$ at each saved time.
 
     **Arguments:**
 
@@ -53,16 +53,16 @@ def canonical_energy(
 def energy_error(
     term: HamiltonianTerm, ts: Times, ys: State, args: PyTree = None
 ) -> Times:
-    r"""By how much the energy balance is violated, at each of the times saved.
+    r"""The error of the energy balance at each saved time.
 
     Along the exact motion the extended Hamiltonian is constant: energy changes only by
-    what damping takes and what is done by forces that depend on time,
+    damping and by forces that depend on time,
 
     $$E(t) - E(t_0) = \int_{t_0}^t \Big( \frac{\partial E}{\partial t}
     - \dot \eta \, p \cdot \frac{\partial E}{\partial p} \Big) \, \mathrm d t.$$
 
-    The error is the left side less the right, whose integral is taken over the states
-    saved, to fourth order in the distance of their times: save every step, or often.
+    The error is the left side minus the right. The integral is computed from the saved
+    states, to fourth order in their spacing: save every step, or often.
 
     **Arguments:**
 
@@ -104,12 +104,12 @@ def structure_defect(
     y: State,
     args: PyTree = None,
 ) -> Inexact[Array, ""]:
-    r"""By how much one step fails to be conformally symplectic.
+    r"""The error of conformal symplecticity of one step.
 
     The largest entry of $J^T \Omega J - e^{\eta(t_0) - \eta(t_1)} \Omega$, where $J$ is
     the Jacobian of the step: zero to rounding for the schemes of this package. Those
-    with two copies of the system are so in the space of both; for these `y` alone is
-    not all of the state, and its defect is small and not zero.
+    with two copies of the system are conformally symplectic in the doubled phase space;
+    their defect in `y` alone is small but not zero.
 
     **Arguments:**
 
@@ -135,7 +135,7 @@ def _structure_defect(term, solver, t0, t1, y, args):
     form = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
     damping = term.hamiltonian.damping
     lost = jnp.zeros_like(t0) if damping is None else damping.increment(t0, t1 - t0)
-    # By reverse mode, which Diffrax's own solvers have.
+    # Diffrax's own solvers support reverse mode.
     jacobian = jax.jacrev(end)(start)
     product = jnp.matmul(jacobian.T, form @ jacobian, precision="highest")
     return jnp.max(jnp.abs(product - jnp.exp(-lost) * form))
@@ -150,11 +150,11 @@ def convergence_order(
     steps: int,
     args: PyTree = None,
 ) -> Inexact[Array, ""]:
-    r"""The order of a solver as measured: of solves with once, twice and four times as
-    many steps, $\log_2 (|y_h - y_{h/2}| / |y_{h/2} - y_{h/4}|)$.
+    r"""The measured order of a solver, $\log_2 (|y_h - y_{h/2}| / |y_{h/2} -
+    y_{h/4}|)$, from solves with once, twice and four times as many steps.
 
-    It is near the order of the scheme where steps are small enough for the error to be
-    one term, and large enough for it not to be rounding.
+    It is close to the order of the scheme if steps are small enough for the leading
+    error to dominate, and large enough for it to exceed rounding.
 
     **Arguments:**
 
@@ -190,8 +190,8 @@ def copy_distance(solver, y: State, solver_state) -> Inexact[Array, ""]:
     """The largest difference between the two copies of the system that a scheme for
     nonseparable Hamiltonians keeps.
 
-    It should stay of the size of the error. Copies that part are a sign of steps that
-    are too large, or of a coupling too weak or in resonance with the step.
+    It should stay of the size of the error. If the copies drift apart, steps are too
+    large, or the coupling is too weak or in resonance with the step.
 
     **Arguments:**
 

@@ -135,7 +135,7 @@ def test_integer_states_are_for_diffeqsolve_to_convert(scheme: Scheme):
 # Terms
 
 ODE = dfx.ODETerm(lambda t, y, args: y)
-STEPPED = "Presymplectic solvers step a `HamiltonianTerm`"
+STEPPED = "Presymplectic solvers need a `HamiltonianTerm`"
 HAND_WRITTEN = "`HamiltonianTerm(VectorField(velocity, force))` for a hand-written"
 
 
@@ -252,7 +252,7 @@ def test_splittings_need_a_split_energy(solver, hamiltonian):
 def test_nystroem_splittings_need_a_quadratic_kinetic_energy(solver, hamiltonian):
     with pytest.raises(ValueError) as error:
         trace(dps.HamiltonianTerm(hamiltonian), solver)
-    needed = "quadratic in the momentum, and known to be"
+    needed = "only for a quadratic kinetic energy"
     Mistake(f"`{type(solver).__name__}`", needed, "`BlanesMoan4()`").check(error)
     assert "`QuadraticKinetic(mass)`" in str(error.value)
 
@@ -275,7 +275,7 @@ ROOT_FINDER = "`root_finder` must be an Optimistix root finder"
 NEWTON = "`optimistix.Newton(rtol=1e-10, atol=1e-10)`"
 SYMMETRIC = "Compositions need a symmetric base"
 BASE = "`base` must be a presymplectic solver"
-TABLEAU = "needs drifts that sum to one and kicks that sum to one, by turns"
+TABLEAU = "alternately drifts that sum to one and kicks that sum to one"
 SUM = "`weights` must sum to one"
 FIXED = "a coupling that does not change with the step"
 WITHOUT_TOLERANCES = dfx.with_stepsize_controller_tols(dfx.VeryChord)()
@@ -290,7 +290,7 @@ SOLVERS = {
     },
     "order of a composition": (
         lambda: dps.Composition(LEAPFROG, [1.0], order=0),
-        Mistake("got 0", "must be a positive integer", "left away"),
+        Mistake("got 0", "must be a positive integer", "omitted"),
     ),
     "weights": (
         lambda: dps.Composition(LEAPFROG, [0.5, 0.25]),
@@ -376,7 +376,7 @@ SOLVERS = {
     ),
     "several couplings": (
         lambda: trace(TERM, dps.PresymplecticTao(jnp.ones(2))),
-        Mistake("has shape (2,)", "must be one number", "`jax.vmap`"),
+        Mistake("has shape (2,)", "must be a scalar", "`jax.vmap`"),
     ),
     **{
         f"first {given!r}": (
@@ -401,7 +401,7 @@ SOLVERS = {
     ),
     "root finder without tolerances": (
         lambda: dps.PresymplecticEuler(root_finder=WITHOUT_TOLERANCES),
-        Mistake("`root_finder` needs", "a tolerance `rtol` of its own", NEWTON),
+        Mistake("`root_finder` needs", "needs a tolerance `rtol`", NEWTON),
     ),
     **{
         f"substeps {n!r}": (
@@ -433,12 +433,12 @@ def test_equal_weights_ask_nothing_of_the_base():
 # Hamiltonians
 
 POSITIVE = "must be positive"
-ONE_NUMBER = "must return one real number, the energy of the whole system"
+ONE_NUMBER = "must return a real scalar for the whole system"
 SUM_OVER = "`jnp.sum(...)`"
 MASS = "`QuadraticKinetic(mass)`"
 LAW = "must be a damping law or a function eta(t)"
 RATE = "`ConstantDamping(rate)`"
-ONE_DAMPING = "must be one number for the whole system"
+ONE_DAMPING = "must be a scalar for the whole system"
 EITHER = "either `kinetic` and `potential`, or `energy`"
 VECTOR = jnp.array([0.1, 0.2])
 
@@ -480,7 +480,7 @@ HAMILTONIANS = {
     ),
     "mass of a wrong structure": (
         lambda: system(dps.QuadraticKinetic({"a": 1.0})),
-        Mistake("got PyTreeDef({'a': *})", "of the structure of `p`", "one number"),
+        Mistake("got PyTreeDef({'a': *})", "of the structure of `p`", "an array"),
     ),
     "list of masses": (
         lambda: system(dps.QuadraticKinetic([1.0, 2.0])),

@@ -213,7 +213,7 @@ NOTHING: Any = None
         (lambda: dps.PresymplecticProjected(5), "2, 4, 6, 8 or 10"),
         (lambda: dps.PresymplecticCoupled(angle=NOTHING), "real number"),
         (lambda: dps.PresymplecticCoupled(scale=-1.0), "positive"),
-        (lambda: dps.Suzuki4(dps.PresymplecticCoupled()), "composes by itself"),
+        (lambda: dps.Suzuki4(dps.PresymplecticCoupled()), "composes its own stages"),
         (lambda: dps.Suzuki4(dps.PresymplecticProjected()), "symmetric"),
         (lambda: dps.PresymplecticMidpoint(NOTHING), "root finder"),
     ],

@@ -294,11 +294,11 @@ WRONG: Any = 1.0
                 1.0,
                 Y0,
             ),
-            "one real number",
+            "a real scalar",
         ),
         "grid steps": (lambda: dps.power_grid(0.0, 1.0, 0, 2.0), "steps"),
         "grid power": (lambda: dps.power_grid(0.0, 1.0, 5, -2.0), "power"),
-        "grid times": (lambda: dps.power_grid(-1.0, 1.0, 5, 2.0), "not negative"),
+        "grid times": (lambda: dps.power_grid(-1.0, 1.0, 5, 2.0), "nonnegative"),
     }.values(),
 )
 def test_bad_input_says_what_to_write(make, message):

@@ -1,4 +1,4 @@
-"""From the end of a step to its start, with the cotangents."""
+"""The backward pass through the steps of a solve."""
 
 from collections.abc import Callable
 from functools import partial
@@ -19,18 +19,18 @@ from ._saves import is_within, materialise, Saved, SavedOutputs
 
 
 class Inputs(NamedTuple):
-    """What goes into a solve."""
+    """The inputs of a solve."""
 
-    start: tuple[PyTree, PyTree]  # the state, and what the solver carries besides
-    parameters: tuple[System, list[Callable]]  # the system, and functions to be saved
-    rest: dict[str, Any]  # all that is not differentiated
+    start: tuple[PyTree, PyTree]  # the state and the solver state
+    parameters: tuple[System, list[Callable]]  # the system, and functions of `SaveAt`
+    rest: dict[str, Any]  # inputs that are not differentiated
     run: Callable  # the loop
 
 
 class Position(NamedTuple):
-    """How far the solve has been run backwards."""
+    """The state of the backward pass."""
 
-    n: Array  # the steps that are left
+    n: Array  # the number of steps left
     t: Array
     state: tuple[PyTree, PyTree]
     bar: tuple[PyTree, PyTree]  # the cotangents of the state
@@ -39,7 +39,7 @@ class Position(NamedTuple):
 
 
 class Backward:
-    """The steps of a solve, each of which can be taken back."""
+    """The backward pass through a solve, step by step."""
 
     def __init__(self, inputs: Inputs, perturbed: Inputs, final, cotangents):
         rest = inputs.rest
@@ -48,7 +48,7 @@ class Backward:
             *(rest[x] for x in ("stepsize_controller", "t0", "t1", "dt0"))
         )
         self.system, _ = inputs.parameters
-        # Of the system, and of all parameters, what is differentiated.
+        # The differentiated leaves of the system, and of all parameters.
         self.wanted, _ = perturbed.parameters
         self.moved, self.fixed = eqx.partition(inputs.parameters, perturbed.parameters)
         saved = rest["saveat"], final, cotangents, self.moved, self.fixed
@@ -57,7 +57,7 @@ class Backward:
         self.carried = materialise(final.solver_state, cotangents.solver_state)
 
     def span(self, n: Array) -> Span:
-        """That of step `n`, in physical time."""
+        """The span of step `n`, in physical time."""
         t0, t1 = (self.system.time(self.time(i)) for i in (n, n + 1))
         return Span(t0, t1, self.solver.step_length(t0, t1))
 
@@ -71,22 +71,22 @@ class Backward:
         left = self.saves.left_at_end(n)
         at = Position(n, self.time(n), (y, carry), bar, gradient, left)
         for i, sub in enumerate(self.saves.subs):
-            # It may have been saved as a step already.
+            # The end may have been saved as a step already.
             if sub.t1 and sub.steps != 1:
                 here = sub.steps == 0 or n % sub.steps != 0
                 at = self._pull_output(at, i, left[i].outputs, here)
         return at
 
     def start(self, at: Position) -> Position:
-        """All that is left was saved at the start, which is more than one state only if
-        the solve has no length."""
+        """Pull back the outputs saved at the start, more than one only for a solve of
+        zero length."""
         for i, left in enumerate(at.left):
             bar = self.saves.sum_of_first(i, left.outputs)
             at = _add(at, self.saves.pull_saved_output(i, at.t, at.state[0], bar))
         return at
 
     def step(self, at: Position, start: PyTree | None = None) -> Position:
-        """Back to the start of the step that ends here; from there, if it is known."""
+        """One step back; `start` is the state at its start, if known."""
         n, system, solver = at.n - 1, self.system, self.solver
         span, moves = self.span(n), solver.moves(system)
         for i, sub in enumerate(self.saves.subs):
@@ -94,7 +94,7 @@ class Backward:
                 at = self._unsave_step(at, i, at.n % sub.steps == 0)
         start_bar = jtu.tree_map(jnp.zeros_like, at.bar)
         if self._may_interpolate():
-            # In most steps nothing was saved between their ends, which is cheaper.
+            # Most steps have no output between their ends, and are cheaper.
             inner = lambda at: self._pull_interpolated(
                 at,
                 n,
@@ -116,7 +116,7 @@ class Backward:
         return self.dense is not None or any(s.ts is not None for s in self.saves.subs)
 
     def _interpolates(self, left: list[Saved], n: Array):
-        """Whether anything that is left was saved by interpolation in step `n`."""
+        """Whether any output left was interpolated in step `n`."""
         if self.dense is not None:
             return True
         inside = [
@@ -131,7 +131,7 @@ class Backward:
         return _add(at, self.saves.pull_saved_output(i, at.t, at.state[0], bar))
 
     def _unsave_step(self, at: Position, i: int, pred: Array) -> Position:
-        """Pull the last output back, if it is of this step's end."""
+        """Pull back the last output if it was saved at the end of this step."""
         times, outputs = at.left[i]
         outputs = outputs - jnp.where(pred, 1, 0)
         at = self._pull_output(at, i, outputs, pred)
@@ -139,8 +139,8 @@ class Backward:
         return at._replace(left=left)
 
     def _pull_interpolated(self, at: Position, n: Array, span: Span, start: PyTree):
-        """Pull back what was saved between the ends of a step: to its end, within the
-        position, and to its start."""
+        """Pull back the outputs between the ends of a step, to its end (in the
+        position) and to its start."""
         t_start = self.time(n)
 
         def dense_info(moved, start, end):
@@ -186,7 +186,7 @@ def _add(at: Position, bars) -> Position:
 
 
 def clock(controller, t0: Array, t1: Array, dt0: Array) -> Callable[[Array], Array]:
-    """When step `n` starts, as the step size controllers of Diffrax would have it."""
+    """The start of step `n`, as computed by the step size controllers of Diffrax."""
     if isinstance(controller, dfx.StepTo):
         return lambda n: controller.ts[n]
     up, down = (jnp.asarray(sign * jnp.inf, t0.dtype) for sign in (1, -1))
@@ -198,7 +198,7 @@ def clock(controller, t0: Array, t1: Array, dt0: Array) -> Callable[[Array], Arr
     def time(n):
         t = t0 + (t1 - t0) * (n.astype(t0.dtype) / steps)
         t = jnp.where((n >= steps) | (t > almost), t1, t)
-        # The first step alone is of the length that was asked for.
+        # Only the first step has the length `dt0`.
         return jnp.where(n == 1, jnp.minimum(t0 + dt0, t1), t)
 
     return time

@@ -1,4 +1,4 @@
-"""The whole gradient, from states that are kept along the way if need be."""
+"""The gradient of a solve, with checkpoints if necessary."""
 
 import equinox as eqx
 import jax.lax as lax
@@ -13,7 +13,7 @@ from ._backward import Backward, Position
 def gradient(
     backward: Backward, checkpoints: int, tol: float | None
 ) -> tuple[PyTree, PyTree]:
-    """The cotangents of the state at the start, and of the parameters."""
+    """The cotangents of the initial state, and of the parameters."""
     final = backward.final
     eps = max(jnp.finfo(x.dtype).eps for x in jtu.tree_leaves(final.y))
     limit = float(eps) ** (2 / 3) if tol is None else tol
@@ -42,18 +42,18 @@ def gradient(
         missed,
         "`ReversibleAdjoint` recomputed the states of this solve with an error beyond "
         "its `tol`: damping or instability amplifies rounding backwards in time. Keep "
-        "more states along the way, `ReversibleAdjoint(checkpoints=...)`, or use "
+        "more states, `ReversibleAdjoint(checkpoints=...)`, or use "
         "`diffrax.RecursiveCheckpointAdjoint()`.",
     )
 
 
 class _Checkpoints:
-    """States from which the solve can be run backwards in parts."""
+    """Known states, between which the backward pass runs in parts."""
 
     def __init__(self, backward: Backward, most: int):
         self.backward, self.most, first = backward, most, backward.first
-        # A step from where friction is infinite cannot be undone: it forgets `p`.
-        # It is taken forwards again instead, from the start, which is known.
+        # A step from a singularity of the friction loses `p` and cannot be inverted. It
+        # is recomputed forwards from the initial state instead.
         system, t0 = backward.system, backward.span(jnp.asarray(0)).t0
         friction = system.friction
         self.singular = None if friction is None else friction.is_singular(t0)
@@ -65,14 +65,14 @@ class _Checkpoints:
             self.known = lax.cond(self.singular, redo, lambda: first)
 
     def first_step(self, at: Position) -> Position:
-        """The step that cannot be undone, if there is one."""
+        """The step that cannot be inverted, if there is one."""
         if self.singular is None:
             return at
         redo = lambda at: self.backward.step(at, start=self.backward.first)
         return lax.cond(self.singular, redo, lambda at: at, at)
 
     def amplification(self) -> Array:
-        """By how much friction amplifies rounding from the end to the start."""
+        """The factor by which friction amplifies rounding from the end to the start."""
         system, final = self.backward.system, self.backward.final
         if system.friction is None:
             return jnp.ones(())
@@ -81,9 +81,10 @@ class _Checkpoints:
         return system.friction.amplification(t0, t1 - t0)
 
     def back_to_start(self, at: Position, parts: Array) -> tuple[Position, Array]:
-        """Back to the start in a number of parts, each from a state that is known.
+        """Back to the start in several parts, each from a known state.
 
-        And the largest error of a state on arrival at one that is known.
+        Also returns the largest error of a recomputed state, measured at the known
+        states.
         """
         length = -(-(at.n - self.skipped) // parts)
         starts = lambda j: jnp.minimum(self.skipped + j * length, at.n)
@@ -98,8 +99,8 @@ class _Checkpoints:
             lambda x: jnp.broadcast_to(x, (self.most, *x.shape)), self.known
         )
         states = lax.fori_loop(1, parts, keep, states)
-        # Units in which positions and momenta compare: the largest there are of each.
-        # What is carried besides may be all rounding, and is not compared.
+        # Positions and momenta are compared in units of their largest values. The
+        # solver state may be pure rounding, and is not compared.
         units = jtu.tree_map(
             lambda x, y: jnp.maximum(_largest(x), _largest(y)),
             *(states[0], at.state[0]),

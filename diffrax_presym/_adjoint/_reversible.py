@@ -1,8 +1,8 @@
 """Gradients by running the scheme backwards.
 
-The inverse of a list of moves is the list of their inverses in the opposite order, so
-that the states of a solve need not be stored for its gradient: each is recomputed from
-the one after it, and cotangents are pulled back through the step between them.
+The inverse of a list of moves is the list of their inverses in reverse order. So the
+states of a solve need not be stored for its gradient: each is recomputed from the next
+one, and cotangents are pulled back through the step between them.
 """
 
 from functools import partial
@@ -25,24 +25,22 @@ from ._checkpoints import gradient
 class ReversibleAdjoint(dfx.AbstractAdjoint):
     r"""Exact gradients in constant memory, by running the scheme backwards.
 
-    The gradient of the numbers that were computed ("discretise, then optimise"): that
-    of `diffrax.RecursiveCheckpointAdjoint`, to rounding, at the cost of two to four
-    solves however many steps there are. The forward pass is that of a solve without
-    gradients.
+    The gradient of the discrete solution ("discretise, then optimise"). It agrees with
+    `diffrax.RecursiveCheckpointAdjoint` to rounding, and costs two to four solves for
+    any number of steps. The forward pass is that of a solve without gradients.
 
-    For every solver of this package that can be reversed, with
-    `diffrax.ConstantStepSize` or `diffrax.StepTo`, with any `SaveAt`, and with respect
-    to `y0`, `args`, all that is inside the term, and all that a function of these or of
-    `SaveAt(fn=...)` closes over. Everything else is refused, in favour of
-    `diffrax.RecursiveCheckpointAdjoint`: events, adaptive steps, derivatives with
-    respect to times. Second derivatives are had by forward mode over reverse mode,
-    `jax.jvp` of `jax.grad`.
+    For every solver of this package with an adjoint method, with
+    `diffrax.ConstantStepSize` or `diffrax.StepTo` and any `SaveAt`, and with respect to
+    `y0`, `args`, the term, and everything that a function of these or of
+    `SaveAt(fn=...)` closes over. Events, adaptive steps and derivatives with respect to
+    times are errors; use `diffrax.RecursiveCheckpointAdjoint` for these. For second
+    derivatives use forward mode over reverse mode, `jax.jvp` of `jax.grad`.
 
-    Damping loses information: on the way back rounding grows by $e^{\eta(t_1) -
-    \eta(t_0)}$. Where that is too much, or the start is missed on arrival there, the
-    solve is repeated, and states are kept along the way from which the way back
-    restarts. Each arrival at a known state measures the error of the states rebuilt,
-    and a gradient made of states with an error beyond `tol` raises an error.
+    Damping loses information: backwards in time rounding errors grow by $e^{\eta(t_1) -
+    \eta(t_0)}$. If this is too much, or the recomputed initial state is inaccurate, the
+    solve is repeated, and states are kept from which the backward pass restarts. The
+    error of the recomputed states is measured at each known state, and one beyond `tol`
+    raises an error.
     """
 
     checkpoints: int = 128
@@ -77,7 +75,7 @@ class ReversibleAdjoint(dfx.AbstractAdjoint):
             raise ValueError(_refuse("a `controller_state`"))
         y, carry = init_state.y, init_state.solver_state
         if init_state.made_jump is not False:
-            # What is carried is stale then, and is recomputed before the first step.
+            # The solver state is stale, and is recomputed before the first step.
             restart = lambda: solver.start(system, system.time(rest["t0"]), y)
             carry = lax.cond(init_state.made_jump, restart, lambda: carry)
         fns = _fns(saveat)
@@ -89,45 +87,44 @@ class ReversibleAdjoint(dfx.AbstractAdjoint):
                 _start, init_state, (None, None, False), is_leaf=_is_none
             ),
         )
-        # What functions close over is differentiated too.
+        # Closures of functions are differentiated too.
         parameters = closure_to_pytree((system, fns))
         inputs = Inputs((y, carry), parameters, rest, _forward)
         if _holds_tracers(parameters, system.time(rest["t0"]), y):
-            # So that it can be told whether these are differentiated. A function
-            # without a closure is not looked into.
+            # Convert them to inputs, which shows whether they are differentiated.
+            # Equinox does not convert a function without a closure.
             run = eqx.filter_closure_convert(partial(_forward), inputs)
             inputs = inputs._replace(run=run)
         out = _solve(inputs, self)
-        # To JAX all that comes out of a custom rule has a derivative, integers too.
+        # To JAX all outputs of a custom rule have derivatives, even integers.
         out, counts = eqx.partition(out, eqx.is_inexact_array)
         return eqx.combine(out, eqxi.nondifferentiable_backward(counts))
 
 
 ReversibleAdjoint.__init__.__doc__ = r"""**Arguments:**
 
-- `checkpoints`: how many states may be kept along the way, besides its two ends. It
-    takes the memory of as many states. With 0 the solve is never repeated. Defaults
-    to 128, enough for an increment of $\eta$ of 1000 in `float64`, and of a few hundred
-    in `float32`.
-- `tol`: the largest error of a rebuilt state, relative to the size of the state.
+- `checkpoints`: the maximum number of states to keep besides the two ends, which
+    determines the memory. With 0 the solve is never repeated. Defaults to 128, enough
+    for an increment of $\eta$ of 1000 in `float64`, and of a few hundred in `float32`.
+- `tol`: the largest error of a recomputed state, relative to the size of the state.
     Defaults to the precision of the state to the power 2/3: 4e-11 in `float64`, 2e-5
     in `float32`.
 
 **Raises:**
 
-`ValueError` if either is out of range, and when the solve is traced if it is one that
-cannot be reversed. `RuntimeError` when the gradient is computed, if a state that is
-known was missed by more than `tol`.
+`ValueError` if either is out of range, and when the solve is traced if it is not
+supported. `RuntimeError` when the gradient is computed, if the error at a known state
+exceeds `tol`.
 """
 
 
-# What `closure_to_pytree` cannot see into.
+# Not covered by `closure_to_pytree`.
 _HIDDEN = (
     "`ReversibleAdjoint` cannot differentiate with respect to an array that a function "
-    "of the Hamiltonian, or of `SaveAt(fn=...)`, holds where it is not seen: in a "
-    "static field, a global variable or an object without `__dict__`. Pass the array "
-    "through `args`, or make it a field of an `equinox.Module` that is not static. Or "
-    "use `diffrax.RecursiveCheckpointAdjoint()` instead."
+    "of the Hamiltonian, or of `SaveAt(fn=...)`, holds in a static field, a global "
+    "variable or an object without `__dict__`. Pass the array through `args`, make it "
+    "a field of an `equinox.Module` that is not static, or use "
+    "`diffrax.RecursiveCheckpointAdjoint()` instead."
 )
 
 
@@ -139,9 +136,9 @@ def _refuse(what: str) -> str:
 
 
 def _check(solver, controller, event) -> None:
-    # Diffrax's wrappers of solvers pass for what they wrap, but have no reverse.
+    # Diffrax's wrappers of solvers have no `reverse`.
     if getattr(solver, "reverse", None) is None:
-        what = f"`{type(solver).__name__}`, of which no reverse is known"
+        what = f"`{type(solver).__name__}`, which has no known adjoint method"
         raise ValueError(_refuse(what))
     if type(controller) not in (dfx.ConstantStepSize, dfx.StepTo):
         raise ValueError(
@@ -154,7 +151,7 @@ def _check(solver, controller, event) -> None:
         raise ValueError(_refuse("events"))
 
 
-# Where these are in what Diffrax passes on.
+# Where these are in the inputs from Diffrax.
 _is_none = lambda x: x is None
 _is_sub = lambda x: isinstance(x, dfx.SubSaveAt)
 _fns = lambda saveat: [sub.fn for sub in jtu.tree_leaves(saveat.subs, is_leaf=_is_sub)]
@@ -211,7 +208,7 @@ def _solve_fwd(perturbed: Inputs, inputs: Inputs, adjoint: ReversibleAdjoint):
         )
     if any(jtu.tree_leaves(perturbed.run)):
         raise ValueError(_HIDDEN)
-    # Not `_solve`, so that forward mode can be taken of this.
+    # Not `_solve`, so that this supports forward mode.
     out = inputs.run(inputs._replace(run=_forward))
     return out, out[0]
 

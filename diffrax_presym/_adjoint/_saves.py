@@ -1,4 +1,4 @@
-"""Cotangents of what a solve has saved."""
+"""Cotangents of the outputs of a solve."""
 
 from typing import NamedTuple
 
@@ -11,14 +11,14 @@ from jaxtyping import Array, PyTree
 
 
 class Saved(NamedTuple):
-    """How much is left of what one of `SaveAt(subs=...)` has saved."""
+    """The number of outputs left of one of `SaveAt(subs=...)`."""
 
-    times: Array  # of its `ts`
-    outputs: Array  # in all
+    times: Array  # those at `ts`
+    outputs: Array  # all
 
 
 class SavedOutputs:
-    """What each of `SaveAt(subs=...)` has saved, and its cotangents."""
+    """The outputs of each of `SaveAt(subs=...)`, and their cotangents."""
 
     def __init__(self, saveat: dfx.SaveAt, final, cotangents, moved, fixed):
         is_sub = lambda x: isinstance(x, dfx.SubSaveAt)
@@ -33,9 +33,9 @@ class SavedOutputs:
         self._moved, self._fixed = moved, fixed
 
     def left_at_end(self, n: Array) -> list[Saved]:
-        """Before what is saved of the end itself, after `n` steps.
+        """The outputs of `n` steps, without that of `t1=True`.
 
-        Counted here, as what Diffrax counts may include an end that was not saved.
+        Counted here, since the count of Diffrax may include an end that was not saved.
         """
         return [
             _left_at_end(sub, state, n)
@@ -50,7 +50,7 @@ class SavedOutputs:
         return jtu.tree_map(lambda x: _sum_of_first(n, x), self._bars[i])
 
     def pull_saved_output(self, i: int, t: Array, y: PyTree, bar: PyTree):
-        """From an output saved of `y` to the parameters and `y` itself."""
+        """Pull back an output saved at `y`, to the parameters and `y`."""
 
         def output(moved, y):
             system, fns = eqx.combine(moved, self._fixed)
@@ -60,20 +60,20 @@ class SavedOutputs:
 
 
 def materialise(like: PyTree, bar: PyTree) -> PyTree:
-    """Cotangents of what can have them, also where there are none."""
+    """The cotangents of all inexact arrays, zero where there are none."""
     like = eqx.filter(like, eqx.is_inexact_array)
     return jtu.tree_map(lambda x, b: jnp.zeros_like(x) if b is None else b, like, bar)
 
 
 def is_within(ts: Array, times: Array, n: Array, t_start: Array) -> Array:
-    """Whether the last of so many `ts` is in step `n`, which begins at `t_start`."""
+    """Whether the last of the first `times` of `ts` is in step `n`, from `t_start`."""
     return (times > 0) & ((n == 0) | (ts[times - 1] > t_start))
 
 
 def _left_at_end(sub: dfx.SubSaveAt, state, n: Array) -> Saved:
     times = jnp.asarray(0)
     if sub.ts is not None:
-        # A solve of no length saves them all without counting.
+        # A solve of zero length saves them all without counting.
         times = jnp.where(n == 0, len(sub.ts), state.saveat_ts_index)
     steps = 0 if sub.steps == 0 else n // sub.steps
     return Saved(times, times + steps + int(sub.t0))

@@ -1,4 +1,4 @@
-"""Friction as an operator on momenta, whatever it is made of."""
+"""Friction as a linear operator on momenta."""
 
 import abc
 
@@ -13,8 +13,8 @@ Scalar = Inexact[Array, ""]
 class AbstractFriction(eqx.Module):
     r"""Linear friction, $p' = F - \Gamma(t) \, p$.
 
-    All that a solver asks of it. Changes are returned rather than new momenta, so that
-    a solver can add them with compensated summation.
+    The interface that solvers use. Methods return changes rather than new momenta, so
+    that solvers can add them with compensated summation.
     """
 
     @abc.abstractmethod
@@ -25,14 +25,14 @@ class AbstractFriction(eqx.Module):
     def carry(self, t: Time, h: Time, p: PyTree, order: int) -> PyTree:
         """The integral of the decaying `p` from `t` to `t + h`.
 
-        Exact where the law allows, and otherwise to the given order in `h`.
+        Exact if known in closed form, otherwise of the given order in `h`.
         """
 
     @abc.abstractmethod
     def respond(self, t: Time, h: Time, force: PyTree, order: int) -> PyTree:
-        """The momentum at `t + h` that a constant force from `t` on leaves.
+        """The momentum gained from `t` to `t + h` under a constant force.
 
-        Exact where the law allows, and otherwise to the given order in `h`.
+        Exact if known in closed form, otherwise of the given order in `h`.
         """
 
     @abc.abstractmethod

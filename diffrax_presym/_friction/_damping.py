@@ -1,4 +1,4 @@
-"""Friction at one rate for all momenta, which may depend on time."""
+"""Friction with one rate for all momenta, which may depend on time."""
 
 import abc
 from collections.abc import Callable
@@ -15,9 +15,9 @@ from ._functions import expm1, expm1_ratio, log_growth, quadrature
 class AbstractDamping(AbstractFriction):
     r"""A log scale $\eta(t)$, or friction $p' = F - \eta'(t) \, p$.
 
-    Positive rates $\eta'$ damp, negative rates excite. A law of your own gives
-    `__call__`, `increment` and `rate`; all else follows from these, `integral` and
-    `response` by quadrature.
+    Positive rates $\eta'$ damp, negative rates excite. Subclasses define `__call__`,
+    `increment` and `rate`; by default `integral` and `response` are computed by
+    quadrature.
     """
 
     @abc.abstractmethod
@@ -28,9 +28,8 @@ class AbstractDamping(AbstractFriction):
     def increment(self, t: Time, h: Time) -> Scalar:
         r"""The difference $\eta(t + h) - \eta(t)$.
 
-        Solvers use $\eta$ through its differences alone. Subtracting two values loses
-        most digits at late times in `float32`, so each law gives its difference in a
-        form without cancellation.
+        Solvers use only differences of $\eta$. Subtracting two values loses most digits
+        at late times in `float32`, so each law computes them without cancellation.
         """
 
     @abc.abstractmethod
@@ -41,21 +40,21 @@ class AbstractDamping(AbstractFriction):
         r"""The integral of $e^{\eta(t) - \eta(s)}$ over $s$ from $t$ to $t + h$.
 
         The displacement under a velocity that is one at $t$ and decays by friction.
-        Exact where the law allows, and otherwise to the given order in `h`.
+        Exact if known in closed form, otherwise of the given order in `h`.
         """
         return quadrature(lambda s: jnp.exp(-self.increment(t, s)), h, order)
 
     def response(self, t: Time, h: Time, order: int) -> Scalar:
         r"""The integral of $e^{\eta(s) - \eta(t + h)}$ over $s$ from $t$ to $t + h$.
 
-        The momentum gained under a unit force. Exact where the law allows, and
-        otherwise to the given order in `h`.
+        The momentum gained under a unit force. Exact if known in closed form,
+        otherwise of the given order in `h`.
         """
         return quadrature(lambda s: jnp.exp(-self.increment(t + s, h - s)), h, order)
 
     def decay(self, t: Time, h: Time, p: PyTree) -> PyTree:
-        # As a factor, rounding would make the same error at every step, and equal
-        # errors add up. The errors of increments vary with `p`, and mostly cancel.
+        # A factor would have the same rounding error at every step, and equal errors
+        # add up. The errors of increments vary with `p`, and mostly cancel.
         return tree_scale(expm1(-_one_number(self.increment(t, h))), p)
 
     def carry(self, t: Time, h: Time, p: PyTree, order: int) -> PyTree:
@@ -75,17 +74,17 @@ class AbstractDamping(AbstractFriction):
         )
 
     def _at_rest(self, rate: Scalar, force: Array, p: Array) -> Array:
-        """The limit of `F - gamma p / t` for `t` to zero, on the motion from rest.
+        """The limit of `F - gamma p / t` as `t` goes to zero, for motion from rest.
 
-        There `p` grows like `F t / (1 + gamma)`. From any other momentum there is none,
-        unless the rate is zero.
+        There `p` grows like `F t / (1 + gamma)`. For any other momentum there is no
+        limit, unless the rate is zero.
         """
         limit = force / (1 + cast_to(self.strength, force))
         return jnp.where((p == 0) | (rate == 0), limit, jnp.nan)
 
     @property
     def strength(self) -> Scalar | float:
-        """The rate times the time since it was infinite, if ever it was."""
+        """The rate times the time since its singularity, or 0 if it has none."""
         return 0.0
 
     def amplification(self, t: Time, h: Time) -> Scalar:
@@ -98,15 +97,15 @@ class AbstractDamping(AbstractFriction):
 def _one_number(damping: Scalar) -> Scalar:
     if jnp.shape(damping) != ():
         raise ValueError(
-            "The damping must be one number for the whole system, but has shape "
-            f"{jnp.shape(damping)}. The momenta share one frame; solve systems with "
-            "different dampings side by side with `jax.vmap`."
+            "The damping must be a scalar for the whole system, but has shape "
+            f"{jnp.shape(damping)}. The momenta share one frame; to solve systems with "
+            "different dampings use `jax.vmap`."
         )
     return damping
 
 
 def _infinite(gamma: Scalar) -> Scalar:
-    """Infinite with the sign of `gamma`, and zero where that is zero."""
+    """Infinity with the sign of `gamma`, or zero where `gamma` is zero."""
     return jnp.where(gamma == 0, 0, jnp.where(gamma > 0, jnp.inf, -jnp.inf))
 
 
@@ -153,11 +152,10 @@ class LogDamping(AbstractDamping):
     (eta1_small) of França, Jordan and Vidal (2021); with $s = 1$ their decaying
     oscillator.
 
-    The rate is infinite at $t = -s$, where positive damping holds a system at rest: a
-    solve may start there, from zero momentum. Schemes whose stages leave the step, such
-    as [`diffrax_presym.PresymplecticYoshida4`][], need a start further from there than
-    the stages reach; else the solve is `nan`, which [`diffrax_presym.Checked`][]
-    reports.
+    The rate is infinite at $t = -s$. With positive damping a solve may start there,
+    from zero momentum. Schemes whose stages extend beyond the step, such as
+    [`diffrax_presym.PresymplecticYoshida4`][], must start far enough from there;
+    otherwise the solve is `nan`, which [`diffrax_presym.Checked`][] reports.
     """
 
     gamma: Scalar
@@ -173,8 +171,7 @@ class LogDamping(AbstractDamping):
         self.shift = as_parameter(shift, "`LogDamping(shift=...)`")
 
     def _since(self, t: Time) -> tuple[Bool[Array, ""], Scalar, Scalar]:
-        """Whether `t` is the singularity, the time since then, or one there, and
-        `gamma`."""
+        """Whether `t` is the singularity, the time since (1 there), and `gamma`."""
         t = as_time(t)
         since = t + cast_to(self.shift, t)
         singular = since == 0
@@ -198,7 +195,7 @@ class LogDamping(AbstractDamping):
         singular, since, gamma = self._since(t)
         growth = jnp.log1p(h / since)
         carried = since * growth * expm1_ratio((1 - gamma) * growth)
-        # At the singularity all momentum is lost before it carries anywhere.
+        # At the singularity all momentum is lost without any displacement.
         return jnp.where(singular, jnp.where(gamma == 0, h, 0), carried)
 
     def response(self, t: Time, h: Time, order: int) -> Scalar:
@@ -221,7 +218,7 @@ class MixedDamping(AbstractDamping):
 
     Between [`diffrax_presym.LogDamping`][] and [`diffrax_presym.ConstantDamping`][]:
     equation (damp_between) of França, Jordan and Vidal (2021). Time must be positive;
-    the remarks on $t = 0$ in [`diffrax_presym.LogDamping`][] hold here too.
+    the remarks on $t = 0$ in [`diffrax_presym.LogDamping`][] apply here too.
     """
 
     gamma1: Scalar
@@ -240,7 +237,7 @@ class MixedDamping(AbstractDamping):
         self.delta = as_parameter(delta, "`MixedDamping(..., delta)`")
 
     def _parameters(self, t: Time):
-        """Whether `t` is the singularity, `t` itself, or one there, and parameters."""
+        """Whether `t` is the singularity, `t` (1 there), and the parameters."""
         t = as_time(t)
         parameters = (cast_to(x, t) for x in (self.gamma1, self.gamma2, self.delta))
         return t == 0, jnp.where(t == 0, 1, t), *parameters
@@ -267,14 +264,14 @@ class MixedDamping(AbstractDamping):
 
     @property
     def strength(self) -> Scalar:
-        return self.gamma1  # the power is weaker
+        return self.gamma1  # the power is less singular
 
     def is_singular(self, t: Time) -> Bool[Array, ""] | None:
         return self._parameters(t)[0]
 
 
 class CallableDamping(AbstractDamping):
-    """Any function `eta(t)` as a damping; its increments are plain differences."""
+    """Any function `eta(t)` as a damping law; its increments are plain differences."""
 
     eta: Callable
 
@@ -290,8 +287,7 @@ class CallableDamping(AbstractDamping):
 
 
 class ScaledDamping(AbstractDamping):
-    """A law times a number: half of the friction, for the frame that positions and
-    momenta share."""
+    """A law times a number, for the frame that positions and momenta share."""
 
     law: AbstractDamping
     factor: float

@@ -1,4 +1,4 @@
-"""Functions of one number that the laws of friction are made of."""
+"""Scalar functions for damping laws."""
 
 import math
 from collections.abc import Callable
@@ -24,8 +24,8 @@ def quadrature(fn: Callable, h: Time, order: int) -> Scalar:
     return jnp.sum(weights * cast_to(jax.vmap(fn)(nodes), h))
 
 
-# exp(x) - 1 and its ratio to x, to rounding and with their derivatives, through zero.
-# XLA's own expm1 takes longer than all else in a leapfrog step of one unknown.
+# exp(x) - 1 and its ratio to x, accurate to rounding near zero, with derivatives. XLA's
+# own expm1 takes longer than the rest of a leapfrog step of one unknown.
 
 
 @jax.custom_jvp
@@ -42,9 +42,9 @@ def _expm1_jvp(x, dx):
 
 @jax.custom_jvp
 def log_growth(h: Time, since: Time) -> Scalar:
-    """The logarithm of `(since + h) / since`; from zero on a large number.
+    """The logarithm of `(since + h) / since`, or 1e30 if `since` is zero.
 
-    A large number and not infinity, whose product with zero is not a number.
+    Not infinity, whose product with zero is not a number.
     """
     return jnp.minimum(jnp.log1p(h / since), 1e30)
 
@@ -68,7 +68,7 @@ def expm1_ratio(x: Scalar) -> Scalar:
 def _expm1_ratio_jvp(x, dx):
     (x,), (dx,) = x, dx
     value, small = expm1_ratio(x), jnp.abs(x) < 0.1
-    # Each branch within its own range: beyond it the derivative would overflow.
+    # Each branch is evaluated within its range: outside, it would overflow.
     near, far = jnp.where(small, x, 0), jnp.where(small, 1, x)
     return value, jnp.where(small, _series(near, 1), (jnp.exp(far) - value) / far) * dx
 

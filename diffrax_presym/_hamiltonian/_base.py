@@ -23,26 +23,25 @@ P = PyTree[Inexact[Array, "..."]]
 
 
 class AbstractHamiltonian(eqx.Module):
-    r"""What is simulated: an energy $E$ and a log scale $\eta$.
+    r"""A Hamiltonian, given by an energy $E$ and a log scale $\eta$.
 
-    Together they are the Hamiltonian
-    $H(t, q, P) = e^{\eta(t)} E(t, q, e^{-\eta(t)} P)$. The state of a solve is $q$
-    and the *mechanical* momentum $p = e^{-\eta(t)} P$, which stays of the size of the
-    velocity however much the system is damped; the canonical momentum $P$ overflows
-    once $\eta(t)$ exceeds 88 in `float32`. The equations of motion are
+    It is $H(t, q, P) = e^{\eta(t)} E(t, q, e^{-\eta(t)} P)$. The state of a solve is
+    $q$ and the *mechanical* momentum $p = e^{-\eta(t)} P$, which stays of the size of
+    the velocity under damping; the canonical momentum $P$ overflows in `float32` once
+    $\eta(t)$ exceeds 88. The equations of motion are
     $q' = \partial E / \partial p$ and
     $p' = -\partial E / \partial q - \eta'(t) \, p$.
     """
 
     damping: AbstractVar[AbstractDamping | None]
-    # The pairs of exact moves that the motion may be made of, the best first. For
-    # example `(KineticSplit(separable=True, nystrom=False),)`, or `()` if no flow of a
-    # part of the energy is known.
+    # The pairs of exact flows into which the motion splits, the best first. For example
+    # `(KineticSplit(separable=True, nystrom=False),)`, or `()` if no exact flow is
+    # known.
     splits: AbstractVar[tuple[AbstractSplit, ...]]
 
     @abc.abstractmethod
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
-        """The mechanical energy $E(t, q, p)$, what a physicist calls the energy."""
+        """The mechanical energy $E(t, q, p)$."""
 
     @abc.abstractmethod
     def velocity(self, t: Time, q: Q, p: P, args: PyTree = None) -> Q:
@@ -58,25 +57,24 @@ class AbstractHamiltonian(eqx.Module):
     ) -> tuple[Q, P | None]:
         """The flow of the kinetic part from `t` to `t + h`, friction included.
 
-        The change of `q`, and that of `p` beyond the friction of `damping`, `None` if
-        there is nothing beyond. Exact where it is known in closed form, and else to the
-        given order in `h`. Asked for by splittings alone, and only if `splits` is not
-        empty.
+        Returns the change of `q`, and that of `p` beyond the friction of `damping` or
+        `None` if there is none. Exact if known in closed form, otherwise of the given
+        order in `h`. Only used by splittings, if `splits` is not empty.
         """
 
     def potential_force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         r"""The force $-\partial V / \partial q$ of the potential part, if there is one.
 
-        All of `force`, unless the kinetic part depends on `q` too.
+        Equal to `force` unless the kinetic part depends on `q` too.
         """
         return self.force(t, q, p, args)
 
     def is_valid(
         self, t: Time, q: Q, p: P, args: PyTree = None
     ) -> Bool[Array, ""] | None:
-        """Whether the energy is defined at this state. Where it is not, a solve fails.
+        """Whether the energy is defined at this state; if not, a solve fails.
 
-        `None`, the default, where it is not worth checking.
+        `None`, the default, means that it is not checked.
         """
         return None
 

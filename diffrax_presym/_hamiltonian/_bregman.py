@@ -30,21 +30,22 @@ class BregmanHamiltonian(AbstractHamiltonian):
     Equation (bregman_ham) of França, Jordan and Vidal (2021), after Wibisono, Wilson
     and Jordan (2016), where $D_{h^*}$ is the Bregman divergence of the convex dual of
     the mirror map $h$. The log scale is $\gamma$, so the state holds
-    $p = e^{-\gamma} P$, and with $m = \nabla h^*(\nabla h(q) + p)$ the motion is
+    $p = e^{-\gamma} P$, and with $m = \nabla h^*(\nabla h(q) + p)$ the equations of
+    motion are
 
     $$\dot q = e^\alpha (m - q), \qquad
     \frac{\mathrm d}{\mathrm dt} \big( \nabla h(q) + p \big)
     = -e^{\alpha + \beta} \nabla f(q).$$
 
-    While nothing kicks, $m$ stays where it is and $q$ decays towards it like
-    $e^{-\gamma}$: the drift is known in closed form for every mirror map, and every
-    splitting for any kinetic energy is explicit, such as [`diffrax_presym.Strang`][]
-    and [`diffrax_presym.BlanesMoan4`][]. It needs $\nabla h$ and $\nabla h^*$ and no
+    During a drift $m$ is constant and $q$ decays towards it like $e^{-\gamma}$. So the
+    drift is known in closed form for every mirror map, and splittings for any kinetic
+    energy are explicit, such as [`diffrax_presym.Strang`][] and
+    [`diffrax_presym.BlanesMoan4`][]. They need $\nabla h$ and $\nabla h^*$ but no
     second derivatives. With [`diffrax_presym.EuclideanMirror`][] the Hamiltonian is
     separable.
 
-    A solve fails where positions leave the domain of the mirror map, where a root find
-    of it fails, or where anything is not finite.
+    A solve fails if positions leave the domain of the mirror map, if its root find
+    fails, or if a value is not finite.
     """
 
     mirror_map: AbstractMirrorMap
@@ -58,27 +59,27 @@ class BregmanHamiltonian(AbstractHamiltonian):
         - `mirror_map`: the mirror map $h$, for example
             [`diffrax_presym.EntropyMirror`][].
         - `objective`: the function to minimise, a function `f(t, q, args)` that returns
-            one number.
+            a scalar.
         - `scaling`: the functions $\alpha$, $\beta$ and $\gamma$ of time, for example
             [`diffrax_presym.PolynomialScaling`][].
-        - `gradient`: the gradient $\nabla f$ by hand, a function
-            `gradient(t, q, args)`. Defaults to automatic differentiation.
+        - `gradient`: the gradient $\nabla f$, a function `gradient(t, q, args)`.
+            Defaults to automatic differentiation.
 
         **Raises:**
 
-        `ValueError` if any of these is of the wrong kind, and when the solve is traced
-        if a function returns values of the wrong shape.
+        `ValueError` if any of these has the wrong type, and when the solve is traced if
+        a function returns values of the wrong shape.
         """
         if not isinstance(mirror_map, AbstractMirrorMap):
             raise ValueError(
                 "`mirror_map` must be a mirror map such as `EntropyMirror()`, but got "
-                f"{mirror_map!r}. For a function `h(q)` of your own write "
+                f"{mirror_map!r}. For a custom function `h(q)` write "
                 "`MirrorMap(h, root_finder=...)`."
             )
         if not isinstance(scaling, AbstractScaling):
             raise ValueError(
                 "`scaling` must be a scaling such as `PolynomialScaling(2.0)`, but got "
-                f"{scaling!r}. For functions of your own write "
+                f"{scaling!r}. For custom functions write "
                 "`Scaling(alpha, beta, gamma, t0=t0, t1=t1)`."
             )
         check_callable(objective, "objective", "f(t, q, args)")
@@ -116,7 +117,7 @@ class BregmanHamiltonian(AbstractHamiltonian):
         if self.mirror_map.is_quadratic:
             return force
         step = self.mirror_map.step(q, p)
-        # The mirror image of q moves by more than p.
+        # The kinetic part depends on q too: its force is p - hess h(q) (m - q).
         _, change = jax.jvp(self.mirror_map.gradient, (q,), (step,))
         kinetic = self.mirror_map.project(tree_sub(p, change))
         return tree_add(force, self.scaling.rate(t), kinetic)
@@ -136,7 +137,7 @@ class BregmanHamiltonian(AbstractHamiltonian):
         dq = tree_scale(-1, lost(self.mirror_map.step(q, p)))
         if self.mirror_map.is_quadratic:
             return dq, None
-        # The mirror image of q moves by more than friction makes up for.
+        # A drift leaves grad h(q) + p constant, while friction changes p by lost(p).
         change = tree_sum(self.mirror_map.change(q, dq), lost(p))
         return dq, self.mirror_map.project(tree_scale(-1, change))
 

@@ -53,14 +53,13 @@ class ConformalHamiltonian(AbstractMechanicalHamiltonian):
             damping.
         - `energy`: an energy that is not separable, as for
             [`diffrax_presym.Hamiltonian`][].
-        - `velocity`, `force`: either by hand, as for
-            [`diffrax_presym.SeparableHamiltonian`][] or
+        - `velocity`, `force`: as for [`diffrax_presym.SeparableHamiltonian`][] or
             [`diffrax_presym.Hamiltonian`][].
 
         **Raises:**
 
-        `ValueError` if both or neither of the two forms is given, and as the classes
-        named above.
+        `ValueError` if both or neither of the two forms is given, and as for these
+        classes.
         """
         if energy is None and kinetic is not None and potential is not None:
             self.E = SeparableEnergy(kinetic, potential, velocity, force)
@@ -87,9 +86,9 @@ class DissipativeHamiltonian(AbstractMechanicalHamiltonian):
     with $\eta_1 = \eta_2$ the same system as
     [`diffrax_presym.ConformalHamiltonian`][].
 
-    No exponential of $\eta_2$ itself is formed for the kinetic energies of this
-    package. It is for a kinetic energy given as a plain function, which therefore
-    overflows in `float32` once $2 \eta_2$ exceeds 88.
+    The kinetic energies of this package do not evaluate the exponential of $\eta_2$
+    itself. A plain function does, and overflows in `float32` once $2 \eta_2$ exceeds
+    88.
     """
 
     E: SeparableEnergy | GeneralEnergy
@@ -102,14 +101,14 @@ class DissipativeHamiltonian(AbstractMechanicalHamiltonian):
             for example [`diffrax_presym.QuadraticKinetic`][], or a function
             `T(t, P, args)`; with `separable=False`, a function `T(t, q, P, args)`.
         - `potential`: the function $f$ to minimise, or potential energy, a function
-            `f(t, q, args)` that returns one number.
+            `f(t, q, args)` that returns a scalar.
         - `eta1`, `eta2`: damping laws or functions of time.
         - `separable`: whether `kinetic` does not depend on `q`. Defaults to `True`.
 
         **Raises:**
 
-        `ValueError` if any of these is of the wrong kind, and when the solve is traced
-        if a function returns values of the wrong shape.
+        `ValueError` if any of these has the wrong type, and when the solve is traced if
+        a function returns values of the wrong shape.
         """
         eta1 = as_damping(eta1, "`eta1`")
         eta2 = as_damping(eta2, "`eta2`")
@@ -152,7 +151,7 @@ class _ScaledKinetic(AbstractKinetic):
     def displacement(self, t, h, p, args, friction, order):
         if not self.is_quadratic:
             return integrate_velocity(self.velocity, t, h, p, args, friction, order)
-        # The decay of exp(eta2 - eta1) and that of the frame, eta2, leave that of eta1.
+        # exp(eta2 - eta1) times the decay of p, exp(-eta2), decays like exp(-eta1).
         scale, kinetic = self._parts(t)
         dq = kinetic.displacement(t, h, p, args, self.eta1, order)
         return tree_scale(scale, dq)

@@ -34,13 +34,13 @@ def check_callable(fn, name: str, signature: str, optional: bool = False):
 
 
 def check_potential(potential):
-    # These can be called with as many arguments, but mean something else: the arguments
-    # are in the wrong order, or an energy that is not separable was given by position.
+    # These are callable too, but mean that the arguments are in the wrong order, or
+    # that a nonseparable energy was passed by position.
     if isinstance(potential, AbstractDamping | AbstractKinetic):
         raise ValueError(
             "`potential` must be a function `V(t, q, args)`, but got "
-            f"{potential!r}. The order is `(kinetic, potential, damping)`; an energy "
-            "that is not separable is passed by name, "
+            f"{potential!r}. The order is `(kinetic, potential, damping)`; for a "
+            "nonseparable energy write "
             "`ConformalHamiltonian(energy=energy, damping=damping)`."
         )
     check_callable(potential, "potential", "V(t, q, args)")
@@ -94,7 +94,7 @@ class SeparableEnergy(eqx.Module):
         splits: list[AbstractSplit] = [kinetic_split]
         if self.force_fn is None and isinstance(self.potential, QuadraticPotential):
             splits.append(PotentialSplit())
-        # The mass is constant, as it is not for every energy quadratic in `p`.
+        # Other energies quadratic in `p` may have a mass that depends on time.
         if isinstance(kinetic, QuadraticKinetic):
             splits.append(SharedSplit(kinetic, damping))
         return tuple(splits)
@@ -144,7 +144,7 @@ class GeneralEnergy(eqx.Module):
         raise ValueError(
             "`Hamiltonian(energy)` has no exact drift, because it is not split into a "
             "kinetic and a potential part. Write `SeparableHamiltonian(kinetic, "
-            "potential)` if it is, or use a solver such as `PresymplecticCoupled()`."
+            "potential)`, or use a solver such as `PresymplecticCoupled()`."
         )
 
     def is_valid(self, q: Q, p: P) -> Bool[Array, ""]:
@@ -152,7 +152,7 @@ class GeneralEnergy(eqx.Module):
 
 
 class AbstractMechanicalHamiltonian(AbstractHamiltonian):
-    """An energy and a law of friction."""
+    """An energy and a damping law."""
 
     E: AbstractVar[SeparableEnergy | GeneralEnergy]
 
@@ -183,7 +183,8 @@ class AbstractMechanicalHamiltonian(AbstractHamiltonian):
 class SeparableHamiltonian(AbstractMechanicalHamiltonian):
     r"""The energy $E = T(t, p) + V(t, q)$, without damping.
 
-    Every scheme of this package is explicit for it. Both parts may depend on time.
+    Every scheme of this package but [`diffrax_presym.PresymplecticMidpoint`][] is
+    explicit for it. Both parts may depend on time.
     """
 
     E: SeparableEnergy
@@ -194,19 +195,18 @@ class SeparableHamiltonian(AbstractMechanicalHamiltonian):
 
         - `kinetic`: the kinetic energy, for example
             [`diffrax_presym.QuadraticKinetic`][], or a function `T(t, p, args)` that
-            returns one number.
-        - `potential`: the potential energy, a function `V(t, q, args)` that returns one
-            number.
-        - `velocity`: the velocity $\partial T / \partial p$ by hand, a function
-            `velocity(t, p, args)`. Defaults to that of `kinetic`, by automatic
-            differentiation if need be.
-        - `force`: the force $-\partial V / \partial q$ by hand, a function
+            returns a scalar.
+        - `potential`: the potential energy, a function `V(t, q, args)` that returns a
+            scalar.
+        - `velocity`: a function `velocity(t, p, args)` for $\partial T / \partial p$.
+            Defaults to that of `kinetic`, by automatic differentiation if necessary.
+        - `force`: the force $-\partial V / \partial q$, a function
             `force(t, q, args)`. Defaults to automatic differentiation.
 
         **Raises:**
 
-        `ValueError` if any of these is of the wrong kind, and when the solve is traced
-        if a function returns values of the wrong shape.
+        `ValueError` if any of these has the wrong type, and when the solve is traced if
+        a function returns values of the wrong shape.
         """
         self.E = SeparableEnergy(kinetic, potential, velocity, force)
 
@@ -220,12 +220,11 @@ class SeparableHamiltonian(AbstractMechanicalHamiltonian):
 
 
 class Hamiltonian(AbstractMechanicalHamiltonian):
-    r"""Any energy $E(t, q, p)$, without damping; not taken to be separable.
+    r"""Any energy $E(t, q, p)$, without damping, treated as nonseparable.
 
     Euler and leapfrog are implicit for it and need a root finder;
-    [`diffrax_presym.PresymplecticCoupled`][] is explicit.
-    If the energy is a sum $T(t, p) + V(t, q)$, write
-    [`diffrax_presym.SeparableHamiltonian`][] instead.
+    [`diffrax_presym.PresymplecticCoupled`][] is explicit. For a sum $T(t, p) + V(t, q)$
+    write [`diffrax_presym.SeparableHamiltonian`][] instead.
     """
 
     E: GeneralEnergy
@@ -234,10 +233,10 @@ class Hamiltonian(AbstractMechanicalHamiltonian):
     def __init__(self, energy, *, velocity=None, force=None):
         r"""**Arguments:**
 
-        - `energy`: the energy, a function `E(t, q, p, args)` that returns one number.
-        - `velocity`: the velocity $\partial E / \partial p$ by hand, a function
+        - `energy`: the energy, a function `E(t, q, p, args)` that returns a scalar.
+        - `velocity`: the velocity $\partial E / \partial p$, a function
             `velocity(t, q, p, args)`. Defaults to automatic differentiation.
-        - `force`: the force $-\partial E / \partial q$ by hand, a function
+        - `force`: the force $-\partial E / \partial q$, a function
             `force(t, q, p, args)`. Defaults to automatic differentiation.
 
         **Raises:**

@@ -26,7 +26,7 @@ from ._quadratic import as_form, divide, multiply
 
 
 class AbstractKinetic(eqx.Module):
-    """A kinetic energy `T(t, p, args)` that knows its velocity."""
+    """A kinetic energy `T(t, p, args)` and its velocity."""
 
     @property
     @abc.abstractmethod
@@ -35,7 +35,7 @@ class AbstractKinetic(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
-        """The kinetic energy, one number for the whole system."""
+        """The kinetic energy of the whole system, a scalar."""
 
     @abc.abstractmethod
     def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
@@ -51,8 +51,11 @@ class AbstractKinetic(eqx.Module):
         friction: AbstractFriction | None,
         order: int,
     ) -> PyTree:
-        """The integral of the velocity from `t` to `t + h`, while nothing but friction
-        acts on `p`. Exact where it can be, and else to the given order in `h`."""
+        """The integral of the velocity from `t` to `t + h`, with only friction acting
+        on `p`.
+
+        Exact if known in closed form, otherwise of the given order in `h`.
+        """
 
     @abc.abstractmethod
     def rescale(self, s: Scalar) -> "AbstractKinetic":
@@ -71,7 +74,7 @@ class QuadraticKinetic(AbstractKinetic):
         """**Arguments:**
 
         - `mass`: the mass, positive, in any of these forms. Defaults to `None`.
-            - `None`: mass one.
+            - `None`: unit mass.
             - A number: the same mass for every degree of freedom.
             - An array with as many dimensions as `p`, and broadcastable to it: a mass
                 for each degree of freedom. For `n` particles in three dimensions, with
@@ -136,8 +139,8 @@ class RelativisticKinetic(AbstractKinetic):
         self.speed = as_positive(speed, "`RelativisticKinetic(speed=...)`")
 
     def _scaled(self, p):
-        """The momentum and `m c` in units of the largest of them, the squares of both,
-        and the unit. Squares of the numbers themselves would overflow."""
+        """The momentum and `m c` in units of the largest of them, their squares, and
+        the unit. Without units the squares would overflow."""
         sizes = jtu.tree_map(lambda x: jnp.max(jnp.abs(x), initial=0), p)
         with jax.numpy_dtype_promotion("standard"):
             unit = jtu.tree_reduce(jnp.maximum, sizes)
@@ -148,7 +151,7 @@ class RelativisticKinetic(AbstractKinetic):
                 f"one speed of light, but these have shape {rest.shape}. For several "
                 "particles write their energy as a function `T(t, p, args)`."
             )
-        # Results do not depend on it, and so neither do their derivatives.
+        # Neither results nor derivatives depend on the unit.
         rest = jnp.maximum(rest, jnp.finfo(rest.dtype).tiny)
         unit = lax.stop_gradient(jnp.maximum(unit, rest))
         p = tree_scale(1 / unit, p)
@@ -171,7 +174,7 @@ class RelativisticKinetic(AbstractKinetic):
             return tree_scale(h, self.velocity(t, p, args))
         p, square, rest, unit = self._scaled(p)
 
-        # The momentum keeps its direction, so that only a number has to be integrated.
+        # The momentum keeps its direction, so only a scalar has to be integrated.
         def speed(s):
             left = 1 + cast_to(friction.decay(t, s, jnp.ones_like(s)), square)
             return left / jnp.sqrt(square * left**2 + rest)
@@ -185,8 +188,7 @@ class RelativisticKinetic(AbstractKinetic):
 
 
 class CallableKinetic(AbstractKinetic):
-    """Any function `T(t, p, args)` as a kinetic energy; its velocity by autodiff, or
-    as given by hand."""
+    """Any function `T(t, p, args)` as a kinetic energy, differentiated by JAX."""
 
     fn: Callable
 
@@ -212,13 +214,13 @@ class CallableKinetic(AbstractKinetic):
 
 
 def integrate_velocity(velocity, t, h, p, args, friction, order) -> PyTree:
-    """The displacement by any velocity `velocity(t, p, args)`, by quadrature."""
+    """The displacement under any velocity `velocity(t, p, args)`, by quadrature."""
 
     def term(s, weight):
         left = p if friction is None else tree_add(p, 1, friction.decay(t, s, p))
         return tree_scale(weight, velocity(t + s, left, args))
 
-    # One node after the other: all at once they would take up memory.
+    # Node by node, to save memory.
     return functools.reduce(tree_sum, map(term, *gauss_legendre(h, order)))
 
 

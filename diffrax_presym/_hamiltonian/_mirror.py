@@ -28,9 +28,9 @@ from ._kinetic import QuadraticKinetic
 class AbstractMirrorMap(eqx.Module):
     r"""A convex function $h$, with $\nabla h$, its inverse $\nabla h^*$ and its domain.
 
-    A point $q$ has the mirror image $\nabla h(q)$, which momenta add to. Everything is
-    asked for relative to a point, because differences of mirror images lose most of
-    their digits in `float32`.
+    A point $q$ has the mirror image $\nabla h(q)$, to which momenta are added. Methods
+    work relative to a point, because differences of mirror images lose most of their
+    digits in `float32`.
     """
 
     @property
@@ -40,7 +40,7 @@ class AbstractMirrorMap(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, q: PyTree) -> Scalar:
-        """The value $h(q)$, one number."""
+        """The value $h(q)$, a scalar."""
 
     @abc.abstractmethod
     def gradient(self, q: PyTree) -> PyTree:
@@ -51,15 +51,15 @@ class AbstractMirrorMap(eqx.Module):
         r"""The point $\nabla h^*(w)$ with mirror image $w$."""
 
     def contains(self, q: PyTree) -> Bool[Array, ""]:
-        """Whether `q` is inside of the domain. False for anything not finite."""
+        """Whether `q` is inside the domain. False if `q` is not finite."""
         return all_finite(q)
 
-    # The difference to the image of `q` itself is exact if there is no step, although
-    # `inverse(gradient(q))` may differ from `q` by rounding.
+    # Relative to `inverse(gradient(q))`, which may differ from `q` by rounding, so that
+    # the step of a zero momentum is exactly zero.
 
     def step(self, q: PyTree, p: PyTree) -> PyTree:
-        r"""The mirror step $\nabla h^*(\nabla h(q) + p) - q$; not finite where there is
-        none."""
+        r"""The mirror step $\nabla h^*(\nabla h(q) + p) - q$; not finite where
+        undefined."""
         image = self.gradient(q)
         return tree_sub(self.inverse(tree_sum(image, p)), self.inverse(image))
 
@@ -68,12 +68,12 @@ class AbstractMirrorMap(eqx.Module):
         return tree_sub(self.gradient(tree_sum(q, dq)), self.gradient(q))
 
     def project(self, p: PyTree) -> PyTree:
-        """`p` without the part that changes nothing, if there is any."""
+        """`p` without the component that has no effect, if there is one."""
         return p
 
 
 class EuclideanMirror(AbstractMirrorMap):
-    r"""The mirror map $h(q) = \tfrac12 \, q \cdot M q$: no mirror at all.
+    r"""The mirror map $h(q) = \tfrac12 \, q \cdot M q$, with a linear $\nabla h$.
 
     Bregman dynamics is then separable, the quadratic case of the paper, and every
     scheme applies.
@@ -85,7 +85,7 @@ class EuclideanMirror(AbstractMirrorMap):
         """**Arguments:**
 
         - `mass`: the mass matrix, in any form of [`diffrax_presym.QuadraticKinetic`][].
-            Defaults to `None`, mass one.
+            Defaults to `None`, unit mass.
 
         **Raises:**
 
@@ -117,11 +117,11 @@ class EuclideanMirror(AbstractMirrorMap):
 class EntropyMirror(AbstractMirrorMap):
     r"""The negative entropy $h(q) = \sum_i q_i \log q_i$, for positive numbers.
 
-    Mirror descent with it is multiplicative. With `simplex=True` it lives on the
+    Mirror descent with it is multiplicative. With `simplex=True` its domain is the
     probability simplex, where $\nabla h^*$ is the softmax: positions stay positive and
-    sum to one, to rounding, without projection. A constant added to all momenta of one
-    simplex changes nothing there. It is left out of every force, so that momenta which
-    sum to zero, as those at rest do, keep doing so.
+    sum to one, to rounding, without projection. A constant added to all momenta of a
+    simplex has no effect. It is removed from every force, so that the sum of momenta
+    that start at rest remains zero.
     """
 
     simplex: bool = eqx.field(static=True)
@@ -135,7 +135,7 @@ class EntropyMirror(AbstractMirrorMap):
         self.simplex = simplex
 
     def __call__(self, q: PyTree) -> Scalar:
-        # On the simplex the linear part is a constant, and left away.
+        # On the simplex the linear part is constant, and omitted.
         linear = 0 if self.simplex else 1
         image = jtu.tree_map(lambda qi: jnp.log(qi) - linear, q)
         return tree_dot(q, image)
@@ -171,7 +171,7 @@ class PNormMirror(AbstractMirrorMap):
 
     Between the geometry of [`diffrax_presym.EuclideanMirror`][], $s = 2$, and one that
     favours sparse solutions, $s \to 1$. The Hessian is infinite where an entry is zero,
-    unless $s = 2$: splittings do without it, all other schemes do not.
+    unless $s = 2$. Use a splitting: all other schemes need the Hessian.
     """
 
     exponent: Scalar
@@ -191,7 +191,7 @@ class PNormMirror(AbstractMirrorMap):
         if known and not bool(jnp.all((self.exponent > 1) & (self.exponent <= 2))):
             raise ValueError(
                 f"{name} must be more than 1 and at most 2, but got {exponent}. For a "
-                "square that is not a norm, write `EuclideanMirror(mass)`."
+                "quadratic form write `EuclideanMirror(mass)`."
             )
 
     def __call__(self, q: PyTree) -> Scalar:
@@ -205,13 +205,13 @@ class PNormMirror(AbstractMirrorMap):
 
 
 def _norm_gradient(x: PyTree, s: Scalar) -> PyTree:
-    """The gradient of half the squared `s`-norm; zero, with its slopes, at zero."""
+    """The gradient of half the squared `s`-norm; zero with zero derivatives at zero."""
     power = lambda a, s: jnp.where(a > 0, jnp.where(a > 0, a, 1) ** cast_to(s, a), 0)
     largest = jtu.tree_reduce(
         jnp.maximum, jtu.tree_map(lambda x: jnp.max(jnp.abs(x), initial=0), x)
     )
-    # In units of the largest entry, whose powers neither overflow nor vanish. It does
-    # not change the result, so it need not be differentiated.
+    # In units of the largest entry, so that powers neither overflow nor vanish. The
+    # result does not depend on the unit, so it need not be differentiated.
     unit = jax.lax.stop_gradient(jnp.where(largest > 0, largest, 1))
     scaled = jtu.tree_map(lambda x: x / cast_to(unit, x), x)
     powers = jtu.tree_map(lambda x: jnp.sum(power(jnp.abs(x), s)), scaled)
@@ -227,8 +227,8 @@ def _norm_gradient(x: PyTree, s: Scalar) -> PyTree:
 class LogBarrierMirror(AbstractMirrorMap):
     r"""The logarithmic barrier $h(q) = -\sum_i \log q_i$, for positive numbers.
 
-    The geometry of Burg's entropy. Mirror images are negative; a momentum that leaves
-    them so is part of the domain, and a solve that violates it fails.
+    The geometry of Burg's entropy. Mirror images are negative; a solve fails where
+    $\nabla h(q) + p$ is not.
     """
 
     def __call__(self, q: PyTree) -> Scalar:
@@ -255,9 +255,8 @@ class HyperbolicMirror(AbstractMirrorMap):
     r"""The hyperbolic entropy
     $h(q) = \sum_i q_i \sinh^{-1}(q_i / s) - \sqrt{q_i^2 + s^2}$.
 
-    Entropic where numbers are large against the scale $s$, and Euclidean where they are
-    small; defined for both signs. A smooth relative of
-    [`diffrax_presym.PNormMirror`][].
+    Entropic for numbers large compared to the scale $s$, and Euclidean for small ones;
+    defined for both signs. A smooth alternative to [`diffrax_presym.PNormMirror`][].
     """
 
     scale: Scalar
@@ -297,10 +296,10 @@ class HyperbolicMirror(AbstractMirrorMap):
 
 
 class MirrorMap(AbstractMirrorMap):
-    r"""A mirror map of your own, from $h$ alone.
+    r"""A mirror map given by a function $h$.
 
-    $\nabla h$ is by automatic differentiation and $\nabla h^*$ by root finding, unless
-    they are given.
+    $\nabla h$ is by automatic differentiation, and $\nabla h^*$ by root finding unless
+    given.
     """
 
     fn: Callable
@@ -320,20 +319,21 @@ class MirrorMap(AbstractMirrorMap):
     ):
         r"""**Arguments:**
 
-        - `h`: a strictly convex function `h(q)` that returns one number.
+        - `h`: a strictly convex function `h(q)` that returns a scalar.
         - `inverse`: the inverse $\nabla h^*$ of the gradient, a function `inverse(w)`.
             Defaults to root finding.
-        - `domain`: a function `domain(q)` that returns whether `q` is inside of the
-            domain of `h`. Defaults to wherever `h(q)` is finite.
+        - `domain`: a function `domain(q)` that returns whether `q` is inside the domain
+            of `h`. Defaults to where `h(q)` is finite.
         - `root_finder`: an Optimistix root finder, needed if `inverse` is not given. It
-            starts from the point where a step starts. Its tolerances bound how well
-            the structure is preserved. Defaults to `None`.
-        - `root_find_max_steps`: the most steps one root find may take. Defaults to 32.
+            starts from the position at the start of a step. Its tolerances limit how
+            well the structure is preserved. Defaults to `None`.
+        - `root_find_max_steps`: the maximum number of steps of a root find. Defaults to
+            32.
 
         **Raises:**
 
-        `ValueError` if any of these is of the wrong kind, or if neither `inverse` nor
-        `root_finder` is given. A root find that fails makes the solve fail.
+        `ValueError` if any of these has the wrong type, or if neither `inverse` nor
+        `root_finder` is given. The solve fails if a root find fails.
         """
         if not callable(h):
             raise ValueError(f"`MirrorMap(h)` needs a function `h(q)`, but got {h!r}.")
@@ -345,7 +345,7 @@ class MirrorMap(AbstractMirrorMap):
         elif inverse is None:
             raise ValueError(
                 "`MirrorMap` needs the inverse of the gradient of `h`, a function "
-                "`inverse(w)`, or else a root finder to find it with, for example "
+                "`inverse(w)`, or a root finder, for example "
                 "`MirrorMap(h, root_finder=optimistix.Newton(rtol=1e-10, atol=1e-10))`."
             )
         self.fn = h

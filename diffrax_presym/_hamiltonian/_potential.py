@@ -13,9 +13,9 @@ _STIFFNESS = "`QuadraticPotential(stiffness)`"
 class QuadraticPotential(eqx.Module):
     r"""The potential energy $V(q) = \tfrac12 \, q \cdot K q$ of linear springs.
 
-    Write it, rather than a function of your own, so that solvers know that the force is
-    linear: Runge--Kutta--Nyström splittings then take any kinetic energy, by swapping
-    the roles of positions and momenta, and the force is one product with $K$.
+    It tells solvers that the force is linear. Runge--Kutta--Nyström splittings then
+    accept any kinetic energy, by swapping the roles of positions and momenta, and the
+    force is one product with $K$.
     """
 
     stiffness: PyTree[Inexact[Array, "..."]] | lx.AbstractLinearOperator | None
@@ -25,7 +25,7 @@ class QuadraticPotential(eqx.Module):
 
         - `stiffness`: the stiffness $K$, of any sign, in any of these forms. Defaults
             to `None`.
-            - `None`: stiffness one.
+            - `None`: unit stiffness.
             - A number: the same stiffness for every degree of freedom.
             - An array with as many dimensions as `q`, and broadcastable to it: a
                 stiffness for each degree of freedom.

@@ -1,4 +1,4 @@
-"""Symmetric linear maps in the forms in which users write masses and stiffnesses."""
+"""Symmetric linear maps, for masses and stiffnesses."""
 
 from collections.abc import Callable
 
@@ -28,7 +28,7 @@ def as_form(form, name: str, positive: bool):
             return as_parameter(x, name)
         if len(shape) != 2 or shape[0] != shape[1]:
             return as_positive(x, name, _MASSLESS)
-        # Perhaps a matrix, whose other entries may have any sign.
+        # It may be a matrix, whose other entries may have any sign.
         as_positive(jnp.diagonal(x), f"The diagonal of {name}", _MASSLESS)
         return as_parameter(x, name)
 
@@ -70,9 +70,9 @@ def apply_form(form, x: PyTree, name: str, state: str, leaf: Callable, operator)
         return jtu.tree_map(lambda xi: one(xi, form), x)
     if jtu.tree_structure(form) != jtu.tree_structure(x):
         raise ValueError(
-            f"{name} must be one number, or a pytree of the structure of `{state}`, "
-            f"{jtu.tree_structure(x)}, but got {jtu.tree_structure(form)}. A list of "
-            "numbers for one array is `jnp.array(...)`."
+            f"{name} must be a number, an array or a pytree of the structure of "
+            f"`{state}`, {jtu.tree_structure(x)}, but got {jtu.tree_structure(form)}. "
+            "Convert a list of numbers with `jnp.array(...)`."
         )
     return jtu.tree_map(one, x, form)
 

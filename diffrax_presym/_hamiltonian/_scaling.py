@@ -36,7 +36,7 @@ class AbstractScaling(eqx.Module):
 
     @abc.abstractmethod
     def rate(self, t: Time) -> Scalar:
-        r"""The rate $e^{\alpha(t)}$ at which positions move to where momenta point."""
+        r"""The rate $e^{\alpha(t)}$ at which positions move along the mirror step."""
 
     @abc.abstractmethod
     def strength(self, t: Time) -> Scalar:
@@ -52,8 +52,8 @@ class PolynomialScaling(AbstractScaling):
 
     The objective converges like $t^{-c}$, equation (scaling2) of França, Jordan and
     Vidal (2021); with $c = 2$ and $C = 1/4$ the motion is that of Nesterov's method.
-    Time must be positive. The frequency of the motion grows like $t^{c/2 - 1}$, so
-    that for $c > 2$ any explicit scheme of given step becomes unstable in the end.
+    Time must be positive. The frequency of the motion grows like $t^{c/2 - 1}$, so that
+    for $c > 2$ any explicit scheme of fixed step eventually becomes unstable.
     """
 
     c: Scalar
@@ -98,7 +98,7 @@ class ExponentialScaling(AbstractScaling):
     r"""$\alpha = \log c$, $\beta = c t + \log C$ and $\gamma = c t$.
 
     The objective converges like $e^{-ct}$, equation (scaling1) of França, Jordan and
-    Vidal (2021). So does the square of the step that an explicit scheme is stable for.
+    Vidal (2021). So does the square of the largest stable step of an explicit scheme.
     """
 
     c: Scalar
@@ -137,8 +137,8 @@ class ExponentialScaling(AbstractScaling):
 class Scaling(AbstractScaling):
     r"""Any functions $\alpha$, $\beta$ and $\gamma$ that satisfy the conditions.
 
-    The conditions are checked beforehand on an interval of time, and again at the end
-    of every step of a solve, which fails where they do not hold.
+    The conditions are checked on a time interval at construction, and again at the end
+    of every step; a solve fails if they do not hold.
     """
 
     alpha_fn: AbstractDamping
@@ -148,15 +148,15 @@ class Scaling(AbstractScaling):
     def __init__(self, alpha, beta, gamma, *, t0, t1):
         r"""**Arguments:**
 
-        - `alpha`, `beta`, `gamma`: functions of time. `gamma` is better given as a
-            damping law such as [`diffrax_presym.LogDamping`][], which knows its
-            differences without cancellation.
+        - `alpha`, `beta`, `gamma`: functions of time. For `gamma` prefer a damping law
+            such as [`diffrax_presym.LogDamping`][], whose differences are computed
+            without cancellation.
         - `t0`, `t1`: the interval of time on which to check the conditions.
 
         **Raises:**
 
-        `ValueError` with the first time found at which a condition is violated, if the
-        functions are known by then, as they are not inside of `jax.grad`.
+        `ValueError` with the first time found at which a condition is violated, unless
+        the functions are traced, as inside `jax.grad`.
         """
         self.alpha_fn = as_damping(alpha, "`alpha`")
         self.beta_fn = as_damping(beta, "`beta`")

@@ -4,14 +4,13 @@ from ._energy import AbstractMechanicalHamiltonian, check_callable, SeparableEne
 
 
 class VectorField(AbstractMechanicalHamiltonian):
-    """A velocity and a force written by hand, with no energy known.
+    """A velocity and a force, without an energy.
 
-    For forces that have no potential, that are random, or whose potential is not worth
-    computing: stochastic gradients, measured force fields. Every scheme for separable
-    Hamiltonians steps it, but only if the two do come from an energy is the result
-    (pre)symplectic. Schemes of order above 4 differentiate both for their dense output,
-    so that functions JAX cannot see through, such as a `jax.pure_callback`, need a
-    `jax.custom_jvp` there.
+    For forces without a potential, random forces, or potentials too expensive to
+    compute: stochastic gradients, measured force fields. Every scheme for separable
+    Hamiltonians accepts it, but is (pre)symplectic only if the two derive from an
+    energy. Schemes of order above 4 differentiate both for dense output, so functions
+    that JAX cannot differentiate, such as `jax.pure_callback`, need a `jax.custom_jvp`.
     """
 
     E: SeparableEnergy
@@ -29,8 +28,8 @@ class VectorField(AbstractMechanicalHamiltonian):
 
         **Raises:**
 
-        `ValueError` if any of these is not a function, and when the solve is traced if
-        a function returns values of the wrong shape. Asking for the energy is an error.
+        `ValueError` if any of these is not a function, when the solve is traced if a
+        function returns values of the wrong shape, and if the energy is evaluated.
         """
         check_callable(velocity, "velocity", "velocity(t, p, args)")
         check_callable(force, "force", "force(t, q, args)")
@@ -40,7 +39,7 @@ class VectorField(AbstractMechanicalHamiltonian):
 
 def _no_energy(*args) -> Scalar:
     raise ValueError(
-        "A `VectorField` has no energy: it knows only its velocity and force. If they "
+        "A `VectorField` has no energy, only a velocity and a force. If they "
         "derive from an energy T(t, p) + V(t, q), write `ConformalHamiltonian(kinetic, "
         "potential, damping)` instead."
     )

@@ -30,20 +30,19 @@ _Carry = TypeVar("_Carry")
 class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
     """A one-step scheme for the term [`diffrax_presym.HamiltonianTerm`][].
 
-    A scheme says how it starts and how it advances; saving, events, adjoints and the
-    direction of time are `diffrax.diffeqsolve`'s, as for any of its own solvers. No
-    scheme estimates its error; to adapt the step, wrap it in `diffrax.HalfSolver`.
+    A scheme defines its initial solver state and its step; `diffrax.diffeqsolve`
+    handles saving, events, adjoints and the direction of time. No scheme has an error
+    estimate: for adaptive steps, wrap it in `diffrax.HalfSolver`.
     """
 
-    # Broader than `HamiltonianTerm`, so that a term of another kind reaches `as_system`
-    # and its error message, which says what to write instead.
+    # Not `HamiltonianTerm`, so that other terms reach the error message of `as_system`.
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar = HermiteInterpolation
 
     @property
     @abc.abstractmethod
     def is_symmetric(self) -> bool:
-        """Whether a step backwards undoes a step."""
+        """Whether the scheme is its own adjoint method."""
 
     @abc.abstractmethod
     def order(self, terms) -> int:
@@ -55,14 +54,11 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
     ) -> tuple[State, _Carry, Result]:
         """One step from `t0` to `t1`, in physical time.
 
-        `h` is their difference, to more digits than subtraction gives.
+        `h` is their difference, which may be more accurate than `t1 - t0`.
         """
 
     def start(self, system: System, t: Array, y: State) -> _Carry:
-        """What the scheme carries from step to step besides the state, at the start.
-
-        Nothing, by default.
-        """
+        """The initial solver state, empty by default."""
         return None  # pyright: ignore[reportReturnType]
 
     def slope(self, system: System, t: Array, y: State, carry: _Carry) -> State:
@@ -71,24 +67,24 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
 
     @property
     def reverse(self) -> "AbstractPresymplecticSolver[_Carry] | None":
-        """The adjoint method: a step of it backwards undoes a step of this scheme.
+        """The adjoint method, or `None` if there is none.
 
-        `None` if there is none that is known.
+        Its step backwards undoes a step of this scheme.
         """
         return self if self.is_symmetric else None
 
     def moves(self, system: System) -> Moves:
-        """The moves of a step: one, unless the scheme is a list of moves."""
+        """The moves of a step; by default the whole step is one move."""
         return step_of(self)
 
     def step_length(self, t0: Array, t1: Array) -> Array:
-        """The difference of the ends of a step of the solve."""
+        """The length of a step of the solve."""
         return t1 - t0
 
     def composition_error(self) -> str | None:
-        """Why the scheme cannot be composed by steps of unequal length, if so.
+        """An error message if the scheme does not allow compositions of unequal steps.
 
-        These cancel errors only if the errors are even in the length of the step.
+        These cancel errors only if the errors are even in the step size.
         """
         if self.is_symmetric:
             return None
@@ -98,7 +94,7 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         )
 
     def distance(self, y: State, solver_state: _Carry) -> Array:
-        """The largest difference between copies of the system, if there are any."""
+        """The largest difference between the copies of the system, if any."""
         raise ValueError(
             f"`{type(self).__name__}` keeps no copies of the system, so there is no "
             "distance between them. Use `PresymplecticCoupled()`, for example."
@@ -113,8 +109,8 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         system = as_system(terms, args)
         t0, t1 = system.time(t0), system.time(t1)
         carry = solver_state
-        # A jump makes what was carried stale. It is a Python bool, and nothing is
-        # traced, unless a controller or the user says otherwise.
+        # After a jump the solver state is stale. Mostly `made_jump` is the Python bool
+        # `False`, and nothing is traced.
         if made_jump is not False and jtu.tree_leaves(carry):
             restart = lambda: self.start(system, t0, y0)
             carry = lax.cond(made_jump, restart, lambda: solver_state)
@@ -135,11 +131,11 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         start: tuple[State, _Carry],
         end: tuple[State, _Carry],
     ) -> dict[str, State]:
-        """What the interpolation of a step needs to know of its two ends."""
+        """The data for the interpolation of a step, from its two ends."""
         (y0, _), (y1, _) = start, end
         slope0, slope1 = self.slope(system, t0, *start), self.slope(system, t1, *end)
         info = dict(y0=y0, y1=y1, k0=tree_scale(h, slope0), k1=tree_scale(h, slope1))
-        # No scheme needs to look at the term to know its order.
+        # The order of a scheme does not depend on the term.
         if self.order(None) > 4:
             second0 = system.second_derivative(t0, y0, slope0)
             second1 = system.second_derivative(t1, y1, slope1)
@@ -151,11 +147,11 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
 
 
 class AbstractMoveSolver(AbstractPresymplecticSolver[_Carry], Generic[_Carry]):
-    """A scheme that is a list of moves, each of which can be undone."""
+    """A scheme given by a list of invertible moves."""
 
     @abc.abstractmethod
     def moves(self, system: System) -> Moves:
-        """The moves of a step, after a check that the scheme can step this system."""
+        """The moves of a step; an error if the scheme does not support the system."""
 
     def advance(
         self, system: System, t0: Array, t1: Array, h: Array, y: State, carry: _Carry
@@ -170,7 +166,7 @@ class AbstractMoveSolver(AbstractPresymplecticSolver[_Carry], Generic[_Carry]):
 
 
 class AdjointMethod(AbstractMoveSolver[_Carry], Generic[_Carry]):
-    """The adjoint method of a list of moves: their inverses in the opposite order."""
+    """The adjoint method of a list of moves: their inverses in reverse order."""
 
     base: AbstractPresymplecticSolver[_Carry]
 
@@ -196,11 +192,11 @@ class AdjointMethod(AbstractMoveSolver[_Carry], Generic[_Carry]):
 
 
 def step_of(solver: AbstractPresymplecticSolver) -> Move:
-    """A whole step of a scheme that is no list of moves."""
+    """The whole step of a scheme as one move."""
 
     def step(solver, system: System, span: Span, stage: Stage) -> Outcome:
         y, carry, result = solver.advance(system, *span, *stage)
         return (y, carry), result
 
-    # Undone only after a check that there is an adjoint method.
+    # Inverted only after a check that there is an adjoint method.
     return Move(partial(step, solver), partial(step, solver.reverse))

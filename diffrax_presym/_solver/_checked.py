@@ -8,16 +8,16 @@ from ._wrapper import AbstractWrapper
 
 
 class Checked(AbstractWrapper[PyTree]):
-    """Any scheme, whose solve fails at the first step that is not finite.
+    """Any scheme, with solves that fail at the first step that is not finite.
 
     Order, cost per step and dense/ts output are those of the base. A potential that
     returns `nan`, a force that overflows, or a step beyond the limit of stability ends
     the solve with `RESULTS.nonfinite`, an error unless `throw=False`, instead of
-    running on to its end with `nan`. Versions of Optimistix without
-    this result say `nonlinear_divergence`.
+    continuing with `nan`. With older versions of Optimistix the result is
+    `nonlinear_divergence`.
 
-    It is not the default as it is not free where a step is a few nanoseconds; around
-    [`diffrax_presym.Substeps`][] it looks once in so many steps.
+    It is not the default because it has a cost where a step takes a few nanoseconds.
+    Around [`diffrax_presym.Substeps`][] it checks once per `n` steps.
     """
 
     base: AbstractPresymplecticSolver

@@ -12,19 +12,20 @@ from ._wrapper import AbstractWrapper
 
 
 class Compensated(AbstractWrapper[PyTree]):
-    """Any explicit scheme, with the digits that its sums lose carried along.
+    """Any explicit scheme, with compensated summation.
 
-    Order, structure and dense/ts output are those of the base; no more evaluations.
-    Each kick and each drift adds a small number to a large one. What rounding drops is
-    kept in the `solver_state` and added to the next, so that the errors left are
-    smaller than rounding by about the length of the step.
+    Order, structure, evaluations per step and dense/ts output are those of the base.
+    Each kick and each drift adds a small number to a large one. The rounding error is
+    kept in the `solver_state` and added to the next increment, so that the remaining
+    error is smaller by about a factor of the step size.
 
-    For very many steps without damping, in `float32` above all. Not for energies that
-    are not separable; nor where friction is strong, which forgets rounding anyway.
+    For very many steps without damping, especially in `float32`. Not for nonseparable
+    energies, nor for strong friction, which damps rounding errors anyway.
 
     ??? cite "Reference"
 
-        Section VIII.5 of Hairer, Lubich and Wanner, see the references; after
+        Section VIII.5 of Hairer, Lubich and Wanner (2006), see
+        [`diffrax_presym.PresymplecticMidpoint`][], after
 
         ```bibtex
         @article{moller1965quasi,
@@ -46,16 +47,15 @@ class Compensated(AbstractWrapper[PyTree]):
 
         - `base`: a presymplectic solver made of kicks and drifts: Euler, leapfrog, or a
             composition or splitting.
-        - `length`: the length of a step, if all are of one length: the `dt0` of the
-            solve. The difference of two times is then replaced by it where the two
-            agree to the rounding of the times. In `float32` that is worth as much as
-            the rest: at a time of 1e4 steps of 0.01 vary by a tenth. Defaults to
-            `None`, the difference.
+        - `length`: the step size, if it is constant: the `dt0` of the solve. It
+            replaces the difference of two times where the two agree to the rounding of
+            the times. In `float32` this matters as much as the rest: at a time of 1e4,
+            steps of 0.01 vary by a tenth. Defaults to `None`, the difference.
 
         **Raises:**
 
-        `ValueError` if `base` is no presymplectic solver or `length` is known not to be
-        positive; and when the solve is traced, for Hamiltonians that are not separable.
+        `ValueError` if `base` is not a presymplectic solver or `length` is known not to
+        be positive; and when the solve is traced, if the Hamiltonian is not separable.
         """
         self.base = base
         self.length = (
@@ -68,7 +68,7 @@ class Compensated(AbstractWrapper[PyTree]):
             return h
         length = jnp.copysign(cast_to(self.length, h), h)
         ulp = jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
-        # Steps of another length, halved ones for example, must be told apart from it.
+        # Steps of another length, for example halved ones, must not be replaced.
         nominal = (jnp.abs(h - length) <= 2 * ulp) & (jnp.abs(length) > 8 * ulp)
         return jnp.where(nominal, length, h)
 

@@ -32,7 +32,7 @@ Weights = tuple[float, ...]
 
 
 class AbstractComposition(AbstractWrapper[PyTree]):
-    """One step made of several steps of a base scheme, by fractions that sum to one."""
+    """Several steps of a base scheme as one, with weights that sum to one."""
 
     weights: AbstractVar[Weights]
 
@@ -52,7 +52,7 @@ class AbstractComposition(AbstractWrapper[PyTree]):
 
 
 def rows(weights: Weights) -> np.ndarray:
-    """Where steps of these lengths start and end, and their lengths."""
+    """Start, end and length of consecutive stages, in units of the step."""
     ends = np.cumsum(weights)
     ends[-1] = 1
     starts = np.concatenate([[0], ends[:-1]])
@@ -60,10 +60,11 @@ def rows(weights: Weights) -> np.ndarray:
 
 
 class Composition(AbstractComposition):
-    """Any composition of a symmetric scheme with itself, by weights of your own.
+    """A composition of a symmetric scheme with itself, given by weights.
 
-    Its cost per step is that of the base times the number of weights. Uses Hermite
-    interpolation for dense/ts output, of 3rd order, or of 5th if `order` exceeds 4.
+    Order as given. The cost per step is that of the base times the number of weights.
+    Uses Hermite interpolation for dense/ts output, of 3rd order, or of 5th if `order`
+    exceeds 4.
     """
 
     base: AbstractPresymplecticSolver
@@ -77,8 +78,8 @@ class Composition(AbstractComposition):
             [`diffrax_presym.PresymplecticLeapfrog`][].
         - `weights`: the lengths of the stages in units of the step: real numbers of any
             sign that sum to one.
-        - `order`: the order of the composition, which the weights imply but do not
-            tell. Used by adaptive step size controllers. Defaults to that of the base.
+        - `order`: the order of the composition, which is not computed from the weights.
+            Used by adaptive step size controllers. Defaults to that of the base.
 
         **Raises:**
 
@@ -93,8 +94,8 @@ class Composition(AbstractComposition):
             )
         if order is not None and (not isinstance(order, int) or order < 1):
             raise ValueError(
-                "`Composition(..., order=...)` must be a positive integer, or left "
-                f"away to claim no more than the order of the base, but got {order!r}."
+                "`Composition(..., order=...)` must be a positive integer, or omitted "
+                f"for the order of the base, but got {order!r}."
             )
         self.base = base
         self.weights = weights
@@ -113,10 +114,11 @@ class SuzukiYoshida(AbstractComposition):
     Uses Hermite interpolation for dense/ts output, of 3rd order, or of 5th if `order`
     exceeds 4.
 
-    The scheme of the paper. Its error constants are large and its stages leave the
-    step, by up to 0.35, 0.65 and 0.92 of its length at orders 4, 6 and 8, on either
-    side. A Hamiltonian that is singular at the start of time, such as with
-    [`diffrax_presym.LogDamping`][] without a shift, is then evaluated before it exists.
+    The scheme of the paper. Its error constants are large, and its stages extend beyond
+    both ends of the step, by up to 0.35, 0.65 and 0.92 of its length at orders 4, 6 and
+    8. A Hamiltonian that is singular at the initial time, such as with
+    [`diffrax_presym.LogDamping`][] without a shift, is then evaluated outside its
+    domain.
 
     ??? cite "Reference"
 
@@ -256,20 +258,7 @@ class Suzuki4(_AbstractTabulated):
     ([`diffrax_presym.PresymplecticYoshida4`][]) at equal cost, and its stages stay
     within the step.
 
-    ??? cite "Reference"
-
-        ```bibtex
-        @article{suzuki1990fractal,
-            author={Suzuki, Masuo},
-            title={Fractal decomposition of exponential operators with applications to
-                   many-body theories and {M}onte {C}arlo simulations},
-            journal={Physics Letters A},
-            volume={146},
-            number={6},
-            pages={319--323},
-            year={1990},
-        }
-        ```
+    Source: Suzuki (1990), see [`diffrax_presym.SuzukiYoshida`][].
     """
 
     base: AbstractPresymplecticSolver = PresymplecticLeapfrog()
@@ -285,7 +274,7 @@ class SofroniouSpaletta6(_AbstractTabulated):
     6th order, 13 stages, symmetric if its base is: with the default base 13 force
     evaluations per step. Uses Hermite interpolation for dense/ts output.
 
-    The composition to take at sixth order, whatever the base. If the kinetic part has a
+    The recommended composition of sixth order, for any base. If the kinetic part has a
     known flow, a [`diffrax_presym.Splitting`][] is more accurate at equal cost.
 
     ??? cite "Reference"
@@ -317,7 +306,7 @@ class SofroniouSpaletta8(_AbstractTabulated):
     8th order, 21 stages, symmetric if its base is: with the default base 21 force
     evaluations per step. Uses Hermite interpolation for dense/ts output.
 
-    The composition to take at eighth order, whatever the base.
+    The recommended composition of eighth order, for any base.
 
     Source: Sofroniou and Spaletta (2005), see [`diffrax_presym.SofroniouSpaletta6`][].
     """
@@ -335,7 +324,7 @@ class SofroniouSpaletta10(_AbstractTabulated):
     10th order, 35 stages, symmetric if its base is: with the default base 35 force
     evaluations per step. Uses Hermite interpolation for dense/ts output.
 
-    For errors close to rounding, where nothing of lower order gets with fewer stages.
+    For errors close to rounding, which lower orders do not reach with fewer stages.
 
     Source: Sofroniou and Spaletta (2005), see [`diffrax_presym.SofroniouSpaletta6`][].
     """
@@ -350,12 +339,12 @@ SofroniouSpaletta10.__init__.__doc__ = _BASE
 class Substeps(AbstractComposition):
     """Several equal steps of a scheme as one step of the solve.
 
-    Order and accuracy at the ends of its steps are those of the base; the cost per step
-    is `n` times its cost. Dense/ts output interpolates across all `n` steps at once,
-    and is coarser accordingly.
+    Order and accuracy at the ends of steps are those of the base; the cost per step is
+    `n` times its cost. Dense/ts output interpolates over all `n` steps at once, and is
+    less accurate.
 
     What `diffeqsolve` does once per step (`SaveAt(ts=...)`, events, `SaveAt(steps=...)`
-    of every `n`-th step, progress meters) it then does `n` times less often.
+    of every `n`-th step, progress meters) is done `n` times less often.
     """
 
     base: AbstractPresymplecticSolver
@@ -365,8 +354,8 @@ class Substeps(AbstractComposition):
         """**Arguments:**
 
         - `base`: any presymplectic solver.
-        - `n`: how many of its steps make one step, a positive integer. The `dt0` of the
-            solve is `n` times the step of the base.
+        - `n`: the number of steps of the base in one step, a positive integer. The
+            `dt0` of the solve is `n` times the step of the base.
 
         **Raises:**
 
@@ -385,7 +374,7 @@ class Substeps(AbstractComposition):
 
 
 def triple_jump(order: int) -> Weights:
-    """The weights of equation (yoshida_comp), correct to the last digit of a float."""
+    """The weights of equation (yoshida_comp), correctly rounded."""
     with localcontext() as context:
         context.prec = 50
         weights = [Decimal(1)]

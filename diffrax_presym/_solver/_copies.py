@@ -1,8 +1,7 @@
 """The moves of schemes with two copies of the system, explicit for any energy.
 
-The copies are each the argument of the other, and live in one moving frame. The state
-of a step in progress is `y, (copy, field)`, with the velocity and force of the last
-exchange.
+Each copy takes arguments from the other, and both share one moving frame. The state
+within a step is `y, (copy, field)`, with the velocity and force of the last exchange.
 """
 
 from collections.abc import Callable
@@ -20,14 +19,14 @@ from ._engine import Move, Outcome, Span, Stage
 
 
 def paired_field(system: System, t: Array, y: State, copy: State) -> State:
-    """Velocity and force where `q` is of one copy and `p` of the other."""
+    """Velocity and force at `q` of one copy and `p` of the other."""
     at = (y[0], copy[1])
     return system.velocity(t, at), system.force(t, at)
 
 
 def exchange(second: bool = False, known: bool = False) -> Move:
-    """The flow of `H(t, q, p_copy)`, equation (tao_map1), or with the `second` of the
-    two copies in the role of the first."""
+    """The flow of `H(t, q, p_copy)`, equation (tao_map1), or of `H(t, q_copy, p)`, for
+    the `second` copy."""
 
     def move(known: bool, system: System, span: Span, stage: Stage) -> Outcome:
         y, (copy, carried) = stage
@@ -43,7 +42,7 @@ def exchange(second: bool = False, known: bool = False) -> Move:
             return (other, (first, carried)), None
         return (first, (other, field)), None
 
-    # The map leaves its own arguments alone.
+    # The map does not change the arguments of its field: its inverse is the same map.
     return Move(partial(move, known), partial(move, False))
 
 
@@ -69,7 +68,7 @@ def coupling(angle: Callable[[Array], Array]) -> Move:
 
 
 def separate(rotated: Callable[[Array, State], State]) -> Move:
-    """From a mean to two copies, by half of their difference, rotated; the inverse
+    """From the mean and half of the difference, rotated, to two copies; the inverse
     joins them."""
 
     def apart(system: System, span: Span, stage: Stage) -> Outcome:
@@ -89,8 +88,8 @@ def separate(rotated: Callable[[Array, State], State]) -> Move:
 def rotate(angle: Array, y: State, scale: ArrayLike = 1.0) -> State:
     """`q` and `p` rotated into each other, with `q` in units of `scale`.
 
-    Both change at once. One after the other they would still look right in the energy,
-    and not be symplectic.
+    Both are updated at once. Sequential updates would not be symplectic, although the
+    energy would look right.
     """
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     q, p = y
@@ -99,7 +98,7 @@ def rotate(angle: Array, y: State, scale: ArrayLike = 1.0) -> State:
 
 
 def largest(x: State) -> Array:
-    """The largest of all entries, without its sign."""
+    """The largest absolute value of all entries."""
     sizes = jtu.tree_map(lambda x: jnp.max(jnp.abs(x), initial=0), values(x))
     with jax.numpy_dtype_promotion("standard"):
         return jtu.tree_reduce(jnp.maximum, sizes)

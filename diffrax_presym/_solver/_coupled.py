@@ -33,14 +33,14 @@ _WEIGHTS = {2: (1.0,)} | {
 
 
 def _free_step(order: int, rotated: Callable[[Array, State], State]) -> Stages:
-    """Two copies that are not coupled during one composed step.
+    """One composed step of two uncoupled copies.
 
-    The leapfrog of both, each the argument of the other, from and to their mean and
+    The leapfrog of both, with arguments from each other. Its state is their mean and
     half of their difference.
     """
     moves = (
         *(exchange(known=True), move_frames, exchange(second=True)),
-        # The next stage begins with its field, as it leaves its arguments alone.
+        # The next stage reuses its field, since its arguments do not change.
         *(move_frames, exchange()),
     )
     table = [(0, 0, 0.5), (0, 0.5, 0.5), (0.5, 0.5, 1), (0.5, 1, 0.5), (1, 1, 0.5)]
@@ -59,21 +59,20 @@ def _check_order(order, name: str) -> int:
 
 
 class PresymplecticCoupled(AbstractMoveSolver[State]):
-    r"""Two copies of the system, turned about their mean once per composed step.
+    r"""Two copies of the system, rotated about their mean once per composed step.
 
     Order 2, 4, 6, 8 or 10 as given; 3, 11, 27, 43 or 71 evaluations of velocity and
     force per step. Explicit for every Hamiltonian, symmetric, and conformally
     symplectic in the doubled phase space. Uses Hermite interpolation for dense/ts
-    output, of 3rd order, or of 5th if `order` exceeds 4, at further cost.
+    output, of 3rd order, or of 5th if `order` exceeds 4, at additional cost.
 
-    For Hamiltonians that are neither separable nor split: the first choice. The idea is
-    that of [`diffrax_presym.PresymplecticTao`][], put together differently. There the
-    copies are coupled within every stage, by a strength that must suit step and system
-    at once. Here they run free for all stages of a step, after which their difference,
-    of the order of the local error, is turned by a fixed angle, so that it cannot
-    accumulate. The solution is their mean, which feels their difference only in second
-    order. No strength is left to choose, and no order is lost. The `solver_state` holds
-    half of the difference.
+    The first choice for Hamiltonians that are neither separable nor split.
+    [`diffrax_presym.PresymplecticTao`][] couples the copies within every stage, by a
+    strength that must suit both step and system. Here they are uncoupled for all stages
+    of a step. Then their difference, of the order of the local error, is rotated by a
+    fixed angle, so that it does not accumulate. The solution is their mean, which
+    depends on the difference only in second order. There is no strength to choose, and
+    no order is lost. The `solver_state` holds half of the difference.
     """
 
     composed_order: int = eqx.field(static=True)
@@ -84,16 +83,15 @@ class PresymplecticCoupled(AbstractMoveSolver[State]):
         r"""**Arguments:**
 
         - `order`: the order, 2, 4, 6, 8 or 10. Defaults to 2.
-        - `angle`: the angle by which the difference of the copies is turned per step,
-            in radians. Multiples of $\pi$ let it accumulate. Defaults to $\pi/2$.
-        - `scale`: the ratio of the sizes of `q` and `p`, as in turning round an orbit
-            one becomes the other. With one that is far off only short steps are stable.
-            Defaults to 1.
+        - `angle`: the angle by which the difference of the copies is rotated per step,
+            in radians. At multiples of $\pi$ it accumulates. Defaults to $\pi/2$.
+        - `scale`: the ratio of the sizes of `q` and `p`, which the rotation mixes. If
+            it is far off, only short steps are stable. Defaults to 1.
 
         **Raises:**
 
-        `ValueError` if the order is none of these, or the angle is not a real number or
-        the scale not a positive one.
+        `ValueError` if the order is not one of these, the angle is not a real number or
+        the scale is not positive.
         """
         self.composed_order = _check_order(order, "PresymplecticCoupled")
         self.angle = as_parameter(angle, "`PresymplecticCoupled(angle=...)`")
@@ -113,14 +111,14 @@ class PresymplecticCoupled(AbstractMoveSolver[State]):
         return _free_step(self.composed_order, self._rotated)
 
     def _rotated(self, h: Array, half: State) -> State:
-        # Half before and half after, in the direction of time: a symmetric step.
+        # Half of the angle before and half after, with the sign of `h`, for symmetry.
         angle = jnp.copysign(cast_to(self.angle, h) / 2, h)
         return rotate(angle, half, cast_to(self.scale, h))
 
     def composition_error(self) -> str | None:
         return (
-            "`PresymplecticCoupled` composes by itself, and rotates its copies only "
-            "after. Write `PresymplecticCoupled(order)`."
+            "`PresymplecticCoupled` composes its own stages, and rotates its copies "
+            "only at the ends of a step. Write `PresymplecticCoupled(order)`."
         )
 
     def distance(self, y: State, solver_state: State) -> Array:
@@ -129,7 +127,7 @@ class PresymplecticCoupled(AbstractMoveSolver[State]):
         **Arguments:**
 
         - `y`: the state at the end of a solve; not used.
-        - `solver_state`: the solver state there, by
+        - `solver_state`: the solver state there, from
             `SaveAt(t1=True, solver_state=True)`.
         """
         return 2 * largest(solver_state)
@@ -139,14 +137,14 @@ class PresymplecticProjected(AbstractPresymplecticSolver[None]):
     r"""Two copies of the system, both set to their mean after each composed step.
 
     Order 2, 4, 6, 8 or 10 as given; 3, 11, 27, 43 or 71 evaluations of velocity and
-    force per step. Explicit for every Hamiltonian. Not symmetric, and symplectic but
-    for an error of higher order that shows over very long times. Uses Hermite
+    force per step. Explicit for every Hamiltonian. Not symmetric, and symplectic up to
+    an error of higher order, which matters over very long times. Uses Hermite
     interpolation for dense/ts output, of 3rd order, or of 5th if `order` exceeds 4, at
-    further cost.
+    additional cost.
 
     For Hamiltonians that are neither separable nor split, over moderate times. As
-    accurate as [`diffrax_presym.PresymplecticCoupled`][] at the same cost, and with
-    nothing to carry from step to step.
+    accurate as [`diffrax_presym.PresymplecticCoupled`][] at the same cost, and without
+    a solver state.
 
     ??? cite "Reference"
 
@@ -184,7 +182,7 @@ class PresymplecticProjected(AbstractPresymplecticSolver[None]):
 
         **Raises:**
 
-        `ValueError` if the order is none of these.
+        `ValueError` if the order is not one of these.
         """
         self.composed_order = _check_order(order, "PresymplecticProjected")
 
@@ -198,7 +196,7 @@ class PresymplecticProjected(AbstractPresymplecticSolver[None]):
     def advance(
         self, system: System, t0: Array, t1: Array, h: Array, y: State, carry: None
     ) -> tuple[State, None, None]:
-        # The difference of the copies is dropped, which cannot be undone.
+        # The difference of the copies is dropped, so the step is not invertible.
         moves = _free_step(self.composed_order, lambda h, half: half)
         zero = jtu.tree_map(jnp.zeros_like, system.values(y))
         (y, _), _ = forward(moves, system, Span(t0, t1, h), (y, zero))

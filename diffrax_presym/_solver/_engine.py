@@ -1,8 +1,8 @@
 """One engine for all schemes that are lists of moves.
 
-A move takes the state of a step over a span of time, and knows its inverse. `Stages`
-are made of moves. What a scheme does to a state, its inverse, and the
-gradient of a step are three ways to go through the same list.
+A move maps the state within a step over a span of time, and has an inverse. `Stages`
+are sequences of moves. A step, its inverse and its vector-Jacobian product all traverse
+the same list.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,8 +21,8 @@ from .._scan import scan_stages
 from .._system import System
 
 
-Result: TypeAlias = dfx.RESULTS | None  # `None`: nothing that could fail was done
-# Of a step in progress: mostly the variables of a split, and what the scheme carries.
+Result: TypeAlias = dfx.RESULTS | None  # `None`: no move could fail
+# The state within a step: usually the variables of a split, and the solver state.
 Stage: TypeAlias = PyTree
 Outcome: TypeAlias = tuple[Stage, Result]
 
@@ -30,7 +30,7 @@ Outcome: TypeAlias = tuple[Stage, Result]
 class Span(NamedTuple):
     """An interval of time.
 
-    `h` is the difference of its ends, to more digits than subtraction gives.
+    `h` is the difference of its ends, which may be more accurate than `t1 - t0`.
     """
 
     t0: Array
@@ -38,7 +38,7 @@ class Span(NamedTuple):
     h: Array
 
     def part(self, start, end, length) -> "Span":
-        """The part between two fractions of it, of so many times its length."""
+        """The part between two fractions of the span, `length` times as long."""
         return Span(self._at(start), self._at(end), length * self.h)
 
     def _at(self, fraction) -> Array:
@@ -53,10 +53,10 @@ class Span(NamedTuple):
 
 
 class Move(NamedTuple):
-    """One move of a scheme: what it does over a span, and what undoes that.
+    """A map over a span of time, and its inverse.
 
     Both are functions of the system, the span and the state at its start, and return
-    the state at its end. What undoes is called with the reversed span.
+    the state at its end. The inverse is called with the reversed span.
     """
 
     do: Callable[[System, Span, Stage], Outcome]
@@ -68,10 +68,10 @@ class Move(NamedTuple):
 
 
 class Stages:
-    """Moves one after the other, once or for each row of a table.
+    """A sequence of moves, repeated for each row of a table.
 
-    A row has three numbers for each of the moves: where the move starts and ends, and
-    its length, in units of the whole.
+    A row has three numbers for each move: its start, end and length, in units of the
+    whole.
     """
 
     moves: "tuple[Moves, ...]"
@@ -92,7 +92,7 @@ Moves: TypeAlias = Move | Stages
 
 
 def forward(moves: Moves, system: System, span: Span, stage: Stage) -> Outcome:
-    """All moves, in their order."""
+    """Apply all moves, in order."""
     return _walk(lambda move, *at: move.do(system, *at), moves, span, stage)
 
 
@@ -104,9 +104,9 @@ def undo(moves: Moves, system: System, span: Span, stage: Stage) -> Stage:
 def vjp(
     moves: Moves, system: System, wanted: PyTree, span: Span, start: Stage, bar: Stage
 ) -> tuple[PyTree, Stage]:
-    """Pull cotangents back through moves, from a state at their start that is known.
+    """The vector-Jacobian product of moves, from the state at their start.
 
-    To what is `wanted` of the system, and to that state.
+    Returns the cotangents of the `wanted` leaves of the system, and of that state.
     """
     moved, fixed = eqx.partition(system, wanted)
     redo = lambda moved, x: forward(moves, eqx.combine(moved, fixed), span, x)[0]
@@ -116,11 +116,10 @@ def vjp(
 def vjp_step(
     moves: Moves, system: System, wanted: PyTree, span: Span, end: Stage, bar: Stage
 ) -> tuple[Stage, PyTree, Stage]:
-    """Undo all moves, and pull cotangents back through them.
+    """Invert all moves, and compute their vector-Jacobian product, move by move.
 
-    From the state at the end and its cotangents to those at the start; and, between
-    the two, the cotangents of what is `wanted` of the system. Move by move, so that
-    none is made more often than it must be.
+    Returns the state at the start, the cotangents of the `wanted` leaves of the system,
+    and those of that state.
     """
 
     def back(move: Move, span: Span, x: PyTree) -> Outcome:
@@ -136,7 +135,7 @@ def vjp_step(
 def _walk(
     act: Callable, moves: Moves, span: Span, state: PyTree, reverse: bool = False
 ) -> Outcome:
-    """Let `act` do every move, with the part of the span it takes, in order."""
+    """Apply `act` to each move and its part of the span, in order."""
     if not isinstance(moves, Stages):
         return act(moves, span, state)
     order = slice(None, None, -1 if reverse else 1)
@@ -151,8 +150,9 @@ def _walk(
     if len(moves.table) == 1:
         return row(state, moves.table[0].tolist())
     columns = np.moveaxis(moves.table, 0, -1)  # moves, three numbers, rows
-    # Constants, to be multiplied by the step inside the loop over the stages: a table
-    # recomputed at each step was measured to take as long as the stages themselves.
+    # Constants, multiplied by the step size inside the loop over the stages.
+    # Recomputing the table at each step was measured to take as long as the stages
+    # themselves.
     flat = columns.reshape(-1, len(moves.table))
     unique, which = np.unique(flat, axis=0, return_inverse=True)
     which = which.reshape(columns.shape[:2])
@@ -160,14 +160,14 @@ def _walk(
     pick = lambda state, numbers: row(state, [[numbers[i] for i in m] for m in which])
     state, results = scan_stages(pick, state, rows, reverse=reverse)
     if results is not None:
-        # The first stage to fail, or any if none did.
+        # The first stage that failed, or any if none did.
         failed = jnp.argmax(results != dfx.RESULTS.successful)
         results = jtu.tree_map(lambda x: x[failed], results)
     return state, results
 
 
 def first_failure(result: Result, other: Result) -> Result:
-    """The first of two results, unless it is a success."""
+    """The first of two results, or the second if the first is a success."""
     if result is None or other is None:
         return other if result is None else result
     return dfx.RESULTS.where(result == dfx.RESULTS.successful, other, result)

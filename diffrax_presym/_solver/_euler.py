@@ -14,10 +14,9 @@ class PresymplecticEuler(AbstractFrozenSolver[None]):
     1st order. One force evaluation per step, explicit for separable Hamiltonians and
     implicit for any other. Uses 3rd order Hermite interpolation for dense/ts output.
 
-    The cheapest step there is, and not symmetric: the two variants are adjoint to each
-    other, a step of one undoes a step backwards of the other. For the same cost
-    [`diffrax_presym.PresymplecticLeapfrog`][] is of second order; take that one unless
-    it is this very map that is wanted, for example as an optimiser.
+    The cheapest scheme. Not symmetric: the two variants are adjoint to each other.
+    [`diffrax_presym.PresymplecticLeapfrog`][] has second order at the same cost; use
+    Euler only where this map itself is wanted, for example as an optimiser.
 
     Equations (presymp_euler) and (presymp_euler2) of França, Jordan
     and Vidal (2021).
@@ -46,17 +45,16 @@ class PresymplecticEuler(AbstractFrozenSolver[None]):
 
 _ARGUMENTS = """**Arguments:**
 
-- `first`: which half of the state moves first, `"momentum"` (the default) or
-    `"position"`.
-- `root_finder`: an Optimistix root finder, needed if the Hamiltonian is not separable
-    and unused if it is. Its tolerances bound how well the structure is preserved.
-    Defaults to `None`.
-- `root_find_max_steps`: the most steps one root find may take. Defaults to 32.
+- `first`: what is updated first, `"momentum"` (the default) or `"position"`.
+- `root_finder`: an Optimistix root finder, used only if the Hamiltonian is not
+    separable, and then required. Its tolerances limit how well the structure is
+    preserved. Defaults to `None`.
+- `root_find_max_steps`: the maximum number of steps of a root find. Defaults to 32.
 
 **Raises:**
 
-`ValueError` if `first` or `root_finder` is of the wrong kind, and when the solve is
-traced, if the Hamiltonian is not separable and no root finder is given.
+`ValueError` if `first` or `root_finder` is invalid; and when the solve is traced, if
+the Hamiltonian is not separable and no root finder is given.
 """
 
 PresymplecticEuler.__init__.__doc__ = _ARGUMENTS

@@ -20,13 +20,13 @@ _Carry = TypeVar("_Carry")
 
 
 class AbstractFrozenSolver(AbstractMoveSolver[_Carry], Generic[_Carry]):
-    """A scheme made of the two half-steps of the paper, adjoint to each other.
+    """A scheme made of the two half-steps of the paper, which are adjoint to each
+    other.
 
     Momentum first is a kick at `t`, then a drift to `t + h` with the velocity frozen at
-    `t`: equation (presymp_euler), A in the design of the schemes. Position first is a
-    drift with the velocity frozen at `t + h`, then a kick there: equation
-    (presymp_euler2), or B. Both are explicit for a separable system, and implicit in
-    their first move for any other.
+    `t`: equation (presymp_euler), here A. Position first is a drift with the velocity
+    frozen at `t + h`, then a kick there: equation (presymp_euler2), here B. Both are
+    explicit for separable systems; for others their first move is implicit.
     """
 
     first: AbstractVar[Literal["momentum", "position"]]
@@ -42,7 +42,7 @@ class AbstractFrozenSolver(AbstractMoveSolver[_Carry], Generic[_Carry]):
             check_root_finder(self.root_finder)
 
     def momentum_first(self, system: System, known: bool = False) -> Stages:
-        """A, of which the force may be known. Its inverse is B, position first."""
+        """A, where the force may be known. Its inverse is B, position first."""
         find = self._find(system)
         moves = frozen_kick(find, known), frozen_drift(find)
         return Stages(moves, [(0, 0, 1), (0, 1, 1)])

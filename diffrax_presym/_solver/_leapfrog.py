@@ -18,20 +18,19 @@ class PresymplecticLeapfrog(AbstractFrozenSolver[PyTree]):
     Hamiltonians and implicit for any other. Uses 3rd order Hermite interpolation for
     dense/ts output.
 
-    The workhorse: for its cost nothing is stable at longer steps. Where more than a few
-    digits are wanted, a scheme of higher order gets there with less work.
+    The default choice: no scheme of this cost is stable at longer steps. For more than
+    a few digits, schemes of higher order are cheaper.
 
-    With `first="momentum"` a step ends with the force that starts the next one, which
-    is carried along, so that dense output needs no evaluations of its own. With
-    `first="position"` nothing is carried and the error is often smaller, but dense
-    output evaluates the force twice more per step.
+    With `first="momentum"` the last force of a step is reused by the next step and by
+    dense output. With `first="position"` the error is often smaller, but dense output
+    costs two more force evaluations per step.
 
     !!! warning
 
-        The force carried with `first="momentum"` is part of the `solver_state`, and
-        belongs to the end of the last step. After an event the solution ends inside
-        that step. To go on from there, pass the state `y` alone (the default), or
-        `made_jump=True` along with the `solver_state`.
+        With `first="momentum"` the `solver_state` is the force at the end of the last
+        step. After an event the solution ends inside that step. To continue from there,
+        pass only the state `y` (the default), or the `solver_state` with
+        `made_jump=True`.
 
     Equations (presymp_leapfrog) and (presymp_leapfrog2) of França, Jordan
     and Vidal (2021).
@@ -49,7 +48,7 @@ class PresymplecticLeapfrog(AbstractFrozenSolver[PyTree]):
         return 2
 
     def start(self, system: System, t: Array, y: State) -> PyTree:
-        # The force that ends a step starts the next only if it does not depend on `p`.
+        # The last force of a step is reused only if it does not depend on `p`.
         if self.first == "momentum" and system.is_separable:
             return system.force(t, y)
         return None
@@ -62,7 +61,7 @@ class PresymplecticLeapfrog(AbstractFrozenSolver[PyTree]):
             return Stages([A, B], halves)
         if not system.is_separable:
             return Stages([B, A], halves)
-        # Two kicks at one place are one.
+        # Two kicks at the same position are merged.
         (kick, drift), (drift_end, _) = A.moves, B.moves
         table = [(0, 0.5, 0.5), (0.5, 0.5, 1), (0.5, 1, 0.5)]
         return Stages([drift_end, kick, drift], table)

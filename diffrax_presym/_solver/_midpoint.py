@@ -10,15 +10,14 @@ from ._moves import root_find
 
 
 class PresymplecticMidpoint(AbstractMoveSolver[None]):
-    """The implicit midpoint rule, in the frame of the middle of the step.
+    """The implicit midpoint rule, in the frame at the middle of the step.
 
     2nd order and symmetric. Implicit for every Hamiltonian: one root find per step, for
-    all of the state. Uses 3rd order Hermite interpolation for dense/ts output, at the
+    the whole state. Uses 3rd order Hermite interpolation for dense/ts output, at the
     cost of two more evaluations of velocity and force.
 
-    For Hamiltonians that are stiff, or not separable and not smooth enough for long
-    explicit steps. Preserves quadratic invariants, such as angular momentum, besides
-    the structure.
+    For Hamiltonians that are stiff, or nonseparable and not smooth enough for long
+    explicit steps. Also preserves quadratic invariants, such as angular momentum.
 
     ??? cite "Reference"
 
@@ -69,12 +68,11 @@ class PresymplecticMidpoint(AbstractMoveSolver[None]):
 PresymplecticMidpoint.__init__.__doc__ = """**Arguments:**
 
 - `root_finder`: an Optimistix root finder, for example
-    `optimistix.Newton(rtol=1e-10, atol=1e-10)`. Its tolerances bound how well the
+    `optimistix.Newton(rtol=1e-10, atol=1e-10)`. Its tolerances limit how well the
     structure is preserved.
-- `root_find_max_steps`: the most steps one root find may take. Defaults to 32.
+- `root_find_max_steps`: the maximum number of steps of a root find. Defaults to 32.
 
 **Raises:**
 
-`ValueError` if `root_finder` is of the wrong kind. A root find that fails makes the
-solve fail.
+`ValueError` if `root_finder` is invalid. The solve fails if a root find fails.
 """

@@ -1,7 +1,7 @@
-"""The moves that the schemes with one copy of the system are made of.
+"""The moves of schemes with one copy of the system.
 
-The state of a step in progress is a pair: the variables of a split or `(q, p)`, and the
-force of the last kick, or `None` if the scheme does not carry it.
+The state within a step is a pair: the variables of a split or `(q, p)`, and the force
+of the last kick, or `None` if the scheme does not reuse it.
 """
 
 from collections.abc import Callable
@@ -39,7 +39,7 @@ def to_split(kind: str) -> Move:
 
 
 def drift(kind: str, order: int) -> Move:
-    """The exact flow of one part of a split, which takes time along."""
+    """The exact flow of one part of a split, which advances time."""
 
     def move(system: System, span: Span, stage: Stage) -> Outcome:
         z, carry = stage
@@ -60,9 +60,9 @@ def _known_kick(system: System, span: Span, stage: Stage) -> Outcome:
 
 
 def kick(kind: str, known: bool = False) -> Move:
-    """The flow of the other part of a split, while time stands still.
+    """The flow of the other part of a split, at fixed time.
 
-    The force is the one that is carried, if it is `known`.
+    If `known`, the force is that of the last kick.
     """
 
     def move(system: System, span: Span, stage: Stage) -> Outcome:
@@ -72,14 +72,14 @@ def kick(kind: str, known: bool = False) -> Move:
     return Move(_known_kick if known else move, move)
 
 
-# The moves of the paper, with forces and velocities frozen at one end. For energies
-# that are not separable one of a move and its inverse is implicit.
+# The moves of the paper, with forces and velocities frozen at one end. For nonseparable
+# energies either a move or its inverse is implicit.
 
 RootFind = Callable[[Callable, PyTree], tuple[PyTree, dfx.RESULTS]]
 
 
 def root_find(root_finder: optx.AbstractRootFinder | None, max_steps: int) -> RootFind:
-    """How to find a change `dx = fn(dx)` of part of a state like `x`."""
+    """A root find for `dx = fn(dx)`, the change of part of a state like `x`."""
 
     def find(fn: Callable, x: PyTree) -> tuple[PyTree, dfx.RESULTS]:
         assert root_finder is not None  # the scheme has checked that there is one
@@ -96,7 +96,7 @@ def root_find(root_finder: optx.AbstractRootFinder | None, max_steps: int) -> Ro
 
 
 def frozen_kick(find: RootFind, known: bool = False) -> Move:
-    """A kick by the force of `p` after it; the inverse is by that of `p` before it."""
+    """A kick by the force at `p` after it; the inverse is by that at `p` before it."""
 
     def before(system: System, span: Span, stage: Stage) -> Outcome:
         return _kicked(system, span, stage, system.force(span.t0, stage[0]))
@@ -133,7 +133,7 @@ def frozen_drift(find: RootFind) -> Move:
     return Move(start, end)
 
 
-# What wrappers do around the moves of a scheme.
+# The moves of wrappers.
 
 
 def _check_finite(system: System, span: Span, stage: Stage) -> Outcome:

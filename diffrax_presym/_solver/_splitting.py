@@ -32,10 +32,10 @@ else:
 
 
 class AbstractSplitting(AbstractMoveSolver[PyTree]):
-    """Exact drifts and kicks alternately, each with a fraction of the step of its own.
+    """Exact drifts and kicks alternately, each over a fraction of the step.
 
-    In the variables of a split, mostly `(q, p)`: where the potential is quadratic
-    instead of the kinetic energy, their roles are swapped.
+    In the variables of a split, usually `(q, p)`. Their roles are swapped if the
+    potential is quadratic and the kinetic energy is not.
     """
 
     tableau: AbstractVar[SplittingTableau]
@@ -53,16 +53,16 @@ class AbstractSplitting(AbstractMoveSolver[PyTree]):
         return "nystrom" if self.tableau.quadratic else "any"
 
     def split(self, system: System) -> AbstractSplit:
-        """The split to step in; an error if the system offers none of the kind."""
+        """The split to use; an error if the system has none of this kind."""
         split, name = system.split(self.kind), type(self).__name__
         if split is not None:
             return split
         if self.kind == "shared":
             raise ValueError(
-                f"`{name}` needs a mass that does not depend on time, and known: "
-                "write `ConformalHamiltonian(QuadraticKinetic(mass), potential, "
-                "damping)` or `SeparableHamiltonian(QuadraticKinetic(mass), "
-                "potential)`. For any other use `TunedRKN6()` or `BlanesMoan6()`."
+                f"`{name}` needs a known mass that does not depend on time. Write "
+                "`ConformalHamiltonian(QuadraticKinetic(mass), potential, damping)` or "
+                "`SeparableHamiltonian(QuadraticKinetic(mass), potential)`. Otherwise "
+                "use `TunedRKN6()` or `BlanesMoan6()`."
             )
         if system.split("any") is None:
             raise ValueError(
@@ -70,18 +70,18 @@ class AbstractSplitting(AbstractMoveSolver[PyTree]):
                 f"potential, but this `{system.name}` is not. "
                 "If it is a sum of the two, give its parts: `SeparableHamiltonian("
                 "kinetic, potential)` or `ConformalHamiltonian(kinetic, potential, "
-                "damping)`. For any other use `PresymplecticCoupled()`."
+                "damping)`. Otherwise use `PresymplecticCoupled()`."
             )
         raise ValueError(
-            f"`{name}` keeps its order only for a kinetic energy quadratic in the "
-            "momentum, and known to be: write it as `QuadraticKinetic(mass)`; or for a "
-            "potential known to be quadratic, `QuadraticPotential(stiffness)`. For any "
-            "other use `BlanesMoan4()` or `BlanesMoan6()`."
+            f"`{name}` keeps its order only for a quadratic kinetic energy, written as "
+            "`QuadraticKinetic(mass)`, or a quadratic potential, written as "
+            "`QuadraticPotential(stiffness)`. Otherwise use `BlanesMoan4()` or "
+            "`BlanesMoan6()`."
         )
 
     def start(self, system: System, t: Array, y: State) -> PyTree:
         split = self.split(system)
-        # The force that ends a step starts the next, if the step starts with a kick.
+        # If a step starts with a kick, its force is the last one of the step before.
         if not self.tableau.kick_first:
             return None
         return split.force(system, t, split.to_split(system, t, y))
@@ -106,20 +106,20 @@ class AbstractSplitting(AbstractMoveSolver[PyTree]):
         return Stages(moves, spans)
 
     def slope(self, system: System, t: Array, y: State, carry: PyTree) -> State:
-        # A kick is by all of the force only if none of it is kinetic.
+        # Otherwise a kick is by a part of the force only.
         known = "separable" in self.split(system).kinds
         return system.slope(t, y, force=carry if known else None)
 
 
 class Splitting(AbstractSplitting):
-    """Any splitting into exact drifts and kicks, by a tableau of your own.
+    """A splitting into exact drifts and kicks, given by a tableau.
 
-    Order as the tableau claims; one force evaluation per kick, and one less if the step
-    starts with a kick. Uses Hermite interpolation for dense/ts output, of 3rd order, or
-    of 5th if the order of the scheme exceeds 4.
+    Order as stated by the tableau; one force evaluation per kick, and one less if the
+    step starts with a kick. Uses Hermite interpolation for dense/ts output, of 3rd
+    order, or of 5th if the order of the scheme exceeds 4.
 
-    For Hamiltonians whose kinetic part has a known flow. Where it has, these schemes
-    are far more accurate than compositions at equal cost.
+    For Hamiltonians whose kinetic part has a known flow, where it is far more accurate
+    than a composition at equal cost.
     """
 
     tableau: SplittingTableau = eqx.field(static=True)
@@ -131,9 +131,8 @@ class Splitting(AbstractSplitting):
 
         **Raises:**
 
-        `ValueError` if the drifts or the kicks do not sum to one, or do not take turns
-        from the first move to a last of the same kind; or if the order is not a
-        positive integer.
+        `ValueError` if the drifts or the kicks do not sum to one, if the first and the
+        last move are of different kinds, or if the order is not a positive integer.
         """
         if not isinstance(tableau, SplittingTableau):
             raise ValueError(
@@ -151,9 +150,9 @@ class Splitting(AbstractSplitting):
         if len(first) != len(second) + 1 or any(not abs(x - 1) < 1e-12 for x in sums):
             names = ("kicks", "drifts")[:: 1 if tableau.kick_first else -1]
             raise ValueError(
-                "`SplittingTableau(fractions=...)` needs drifts that sum to one and "
-                "kicks that sum to one, by turns, an odd number of moves in all; but "
-                f"got {len(first)} {names[0]} that sum to {sums[0]} and {len(second)} "
+                "`SplittingTableau(fractions=...)` needs an odd number of moves, "
+                "alternately drifts that sum to one and kicks that sum to one, but got "
+                f"{len(first)} {names[0]} that sum to {sums[0]} and {len(second)} "
                 f"{names[1]} that sum to {sums[1]}. To scale them, divide each kind by "
                 "its sum."
             )
@@ -164,11 +163,11 @@ class Strang(AbstractSplitting):
     """Strang's splitting: kick, drift, kick; the leapfrog with an exact drift.
 
     2nd order and symmetric. One force evaluation per step. Uses 3rd order Hermite
-    interpolation for dense/ts output, at no cost for a separable Hamiltonian and of two
-    more for any other.
+    interpolation for dense/ts output, at the cost of two more unless the Hamiltonian is
+    separable.
 
-    For any Hamiltonian with a kinetic part of known flow, above all
-    [`diffrax_presym.BregmanHamiltonian`][], for which it is explicit where
+    For any Hamiltonian with a kinetic part of known flow, especially
+    [`diffrax_presym.BregmanHamiltonian`][], for which it is explicit and
     [`diffrax_presym.PresymplecticLeapfrog`][] is not.
 
     ??? cite "Reference"
@@ -196,8 +195,8 @@ class BlanesMoan4(AbstractSplitting):
     Hermite interpolation for dense/ts output, at the cost of two more.
 
     For any Hamiltonian with a kinetic part of known flow, such as a relativistic one.
-    If that or the potential is quadratic, [`diffrax_presym.BlanesMoanRKN4`][] is faster
-    still.
+    If the kinetic energy or the potential is quadratic,
+    [`diffrax_presym.BlanesMoanRKN4`][] is more efficient.
 
     ??? cite "Reference"
 
@@ -225,8 +224,8 @@ class BlanesMoan6(AbstractSplitting):
     interpolation for dense/ts output, at the cost of the force and its derivative along
     the flow at both ends.
 
-    For any Hamiltonian with a kinetic part of known flow. If that or the potential is
-    quadratic, [`diffrax_presym.TunedRKN6`][] is faster still.
+    For any Hamiltonian with a kinetic part of known flow. If the kinetic energy or the
+    potential is quadratic, [`diffrax_presym.TunedRKN6`][] is more efficient.
 
     Source: Blanes and Moan (2002), see [`diffrax_presym.BlanesMoan4`][].
     """
@@ -240,8 +239,8 @@ class BlanesMoanRKN4(AbstractSplitting):
     4th order and symmetric. Six force evaluations per step. Uses 3rd order Hermite
     interpolation for dense/ts output, at no cost.
 
-    For quadratic kinetic energies, or quadratic potentials, which it takes advantage
-    of: the first choice for moderate accuracy.
+    For quadratic kinetic energies or quadratic potentials: the first choice at moderate
+    accuracy.
 
     Source: Blanes and Moan (2002), see [`diffrax_presym.BlanesMoan4`][].
     """
@@ -256,8 +255,8 @@ class BlanesMoanRKN6(AbstractSplitting):
     Hermite interpolation for dense/ts output, at the cost of the force and its
     derivative along the flow at both ends.
 
-    For quadratic kinetic energies, or quadratic potentials, which it takes advantage
-    of. [`diffrax_presym.TunedRKN6`][] is more accurate where motions oscillate.
+    For quadratic kinetic energies or quadratic potentials. For oscillations
+    [`diffrax_presym.TunedRKN6`][] is more accurate.
 
     Source: Blanes and Moan (2002), see [`diffrax_presym.BlanesMoan4`][].
     """
@@ -272,8 +271,8 @@ class BlanesCasasRKN8(AbstractSplitting):
     Hermite interpolation for dense/ts output, at the cost of the force and its
     derivative along the flow at both ends.
 
-    For quadratic kinetic energies, or quadratic potentials, which it takes advantage
-    of: the first choice towards the limit of `float64`.
+    For quadratic kinetic energies or quadratic potentials: the first choice for errors
+    close to rounding in `float64`.
 
     ??? cite "Reference"
 
@@ -301,40 +300,39 @@ class TunedRKN6(AbstractSplitting):
     interpolation for dense/ts output, at the cost of two derivatives of the force along
     the flow.
 
-    For quadratic kinetic energies, or quadratic potentials. With the same number of
-    evaluations as [`diffrax_presym.BlanesMoanRKN6`][] it errs much less where motions
-    oscillate about equilibria, as most do: the first choice from six digits on.
+    For quadratic kinetic energies or quadratic potentials: the first choice from six
+    digits on. For oscillations about equilibria its error is much smaller than that of
+    [`diffrax_presym.BlanesMoanRKN6`][] at equal cost.
 
-    Its coefficients are of this package: they fulfil the conditions of order 6, and
-    make small what errors are left to an oscillator, over a range of frequencies, and
-    at the next order to any force, `benchmarks/tuning.py`.
+    Source: this package, `benchmarks/tuning.py`. The coefficients satisfy the
+    conditions of order 6, and reduce the remaining error for oscillators over a range
+    of frequencies and, at the next order, for any force.
     """
 
     tableau: ClassVar[SplittingTableau] = TUNED_RKN_6
 
 
 class TunedLinear8(AbstractSplitting):
-    r"""A splitting for linear forces, with steps of half a period and more.
+    r"""A splitting for linear forces, with steps of half a period or more.
 
     8th order and symmetric for linear forces and constant friction. Fourteen force
     evaluations per step. Uses 5th order Hermite interpolation for dense/ts output, at
     the cost of two more and of two of the derivative of the force along the flow.
 
-    For damped waves, networks of springs, quadratic objectives: anything whose force is
-    linear in the positions, a matrix or a stencil. Per evaluation nothing else here
-    takes steps as long: at step times highest frequency of 0.26 for each evaluation, or
-    3.6 for a step, the error of a step is 1e-9. Its coefficients are tuned for a range
-    of frequencies rather than for ever shorter steps. The friction is split between
-    positions and momenta, $q = e^{-\eta / 2} x$, in which the motion is again that of
-    oscillators, so that constant friction costs no accuracy up to rates of twice the
-    highest frequency.
+    For forces linear in the positions, by a matrix or a stencil: damped waves, networks
+    of springs, quadratic objectives. It allows the longest steps per force evaluation:
+    the error of a step is 1e-9 if the step times the highest frequency is 3.6, or 0.26
+    per evaluation. Its coefficients are tuned for a range of frequencies rather than
+    for short steps. With friction split between positions and momenta, $q = e^{-\eta /
+    2} x$, the motion of $x$ is again an oscillation, so that constant friction costs no
+    accuracy up to rates of twice the highest frequency.
 
-    Of 4th order, and worse than [`diffrax_presym.TunedRKN6`][], where the force is not
-    linear, or it or the friction depends on time. Not for friction $\gamma / t$ from
-    $t = 0$. Such long steps are longer than interpolation can follow: to save at many
-    times, let the steps end there, with `diffrax.StepTo`.
+    Only of 4th order, and less accurate than [`diffrax_presym.TunedRKN6`][], if the
+    force is nonlinear, or if force or friction depends on time. Not for friction
+    $\gamma / t$ from $t = 0$. Interpolation over such long steps is inaccurate: to save
+    at many times, let steps end there, with `diffrax.StepTo`.
 
-    Its coefficients are of this package: `benchmarks/tuning.py`.
+    Source: this package, `benchmarks/tuning.py`.
     """
 
     tableau: ClassVar[SplittingTableau] = TUNED_LINEAR_8

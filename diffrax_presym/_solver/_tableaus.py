@@ -1,7 +1,7 @@
-"""The coefficients of the schemes, and nothing else.
+"""The coefficients of the schemes.
 
-All are symmetric, so the first half is listed, up to and with the middle. The digits
-are those that are known, more than a float holds.
+All are symmetric, so only the first half is listed, including the middle. All known
+digits are kept, more than a float holds.
 """
 
 from typing import NamedTuple
@@ -15,17 +15,17 @@ class CompositionTableau(NamedTuple):
 
 
 class SplittingTableau(NamedTuple):
-    """The fractions of a step taken by drifts and kicks, by turns."""
+    """The fractions of a step taken by drifts and kicks alternately."""
 
     order: int
     kick_first: bool
-    # Whether the order relies on a kinetic energy or a potential that is quadratic.
+    # Whether the order requires a quadratic kinetic energy or a quadratic potential.
     quadratic: bool
     fractions: tuple[float, ...]
 
 
 def mirror(*half: float) -> tuple[float, ...]:
-    """A palindrome of odd length from its first half, up to and with the middle."""
+    """A palindrome of odd length from its first half, including the middle."""
     return (*half, *half[-2::-1])
 
 

@@ -20,15 +20,15 @@ class PresymplecticTao(AbstractMoveSolver[_Carry]):
     evaluations of velocity and force per step. Uses 3rd order Hermite interpolation for
     dense/ts output, at the cost of two more.
 
-    The system is doubled: the copy $(\bar q, \bar p)$ provides the arguments that would
-    make the scheme implicit, and a harmonic coupling of strength $\xi$ holds it close.
-    Both copies live in one moving frame and the coupling acts there, unscaled, so that
-    it stays of the size of the dynamics however much the system is damped. The
-    `solver_state` holds the copy, and the solution is the original.
+    The phase space is doubled: the copy $(\bar q, \bar p)$ replaces the arguments that
+    would make the scheme implicit, and a harmonic coupling of strength $\xi$ keeps it
+    close. Both copies share one moving frame, in which the coupling acts unscaled, so
+    that it stays of the size of the dynamics under damping. The solution is the
+    original, and the `solver_state` holds the copy.
 
-    The scheme of the paper. For Hamiltonians that are not separable; of those,
-    [`diffrax_presym.PresymplecticCoupled`][] is many times as accurate at equal cost,
-    above all at higher orders, and has no coupling to choose.
+    The scheme of the paper for nonseparable Hamiltonians.
+    [`diffrax_presym.PresymplecticCoupled`][] is much more accurate at equal cost,
+    especially at higher orders, and has no coupling to choose.
 
     ??? cite "Reference"
 
@@ -56,14 +56,14 @@ class PresymplecticTao(AbstractMoveSolver[_Carry]):
         - `coupling`: the strength $\xi$ of the coupling, positive, in units of one over
             time. A few times the highest frequency of the system is a good value.
             Avoid $2 \xi h$ near a multiple of $\pi$, where the coupling resonates with
-            the step. Defaults to `None`, which takes $\xi = 3\pi / 16h$, half-way
-            between such trouble and copies that part; this is for use on its own and
-            not inside a [`diffrax_presym.Composition`][].
+            the step. Defaults to `None`, which is $\xi = 3\pi / 16h$, half-way between
+            resonance and copies that drift apart; not for use inside a
+            [`diffrax_presym.Composition`][].
 
         **Raises:**
 
         `ValueError` if `coupling` is known not to be positive, and when the solve is
-        traced if it is not one number.
+        traced if it is not a scalar.
         """
         if coupling is not None:
             coupling = as_positive(coupling, "`PresymplecticTao(coupling)`")
@@ -80,7 +80,7 @@ class PresymplecticTao(AbstractMoveSolver[_Carry]):
         return y, paired_field(system, t, y, y)
 
     def moves(self, system: System) -> Moves:
-        # The last map leaves its own arguments alone: its field starts the next step.
+        # The last map does not change its arguments: the next step reuses its field.
         moves = (
             *(exchange(known=True), move_frames, exchange(second=True)),
             coupling(self._angle),
@@ -98,7 +98,7 @@ class PresymplecticTao(AbstractMoveSolver[_Carry]):
             return None
         return (
             "Inside a composition `PresymplecticTao` needs a coupling that does not "
-            "change with the step, or the order is lost. Write "
+            "change with the step size, or the order is lost. Write "
             "`PresymplecticTao(coupling)` with a few times the highest frequency of "
             "the system, or `PresymplecticCoupled(order)`, which needs none."
         )
@@ -109,7 +109,7 @@ class PresymplecticTao(AbstractMoveSolver[_Carry]):
         **Arguments:**
 
         - `y`: the state at the end of a solve.
-        - `solver_state`: the solver state there, by
+        - `solver_state`: the solver state there, from
             `SaveAt(t1=True, solver_state=True)`.
         """
         copy, _ = solver_state
@@ -120,8 +120,7 @@ class PresymplecticTao(AbstractMoveSolver[_Carry]):
             return jnp.copysign(cast_to(3 * np.pi / 8, h), h)
         if jnp.shape(self.coupling) != ():
             raise ValueError(
-                "`PresymplecticTao(coupling)` must be one number, but has shape "
-                f"{jnp.shape(self.coupling)}. To compare several, solve side by side "
-                "with `jax.vmap`."
+                "`PresymplecticTao(coupling)` must be a scalar, but has shape "
+                f"{jnp.shape(self.coupling)}. To compare several, use `jax.vmap`."
             )
         return 2 * cast_to(self.coupling, h) * h

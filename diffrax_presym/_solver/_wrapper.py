@@ -18,7 +18,7 @@ _Carry = TypeVar("_Carry")
 
 
 class AbstractWrapper(AbstractMoveSolver[_Carry], Generic[_Carry]):
-    """A scheme made of another one, with all that is known of that."""
+    """A scheme that wraps another one and shares its properties."""
 
     base: AbstractVar[AbstractPresymplecticSolver]
 
