@@ -328,7 +328,7 @@ def test_objective_falls_like_exp_of_beta(rate):
             dps.Scaling(jnp.log, rising, rising, t0=0.5, t1=4.0),
         )
     beta = jax.vmap(H.scaling.beta)
-    y0 = (H.scaling.beta(jnp.array([1.0])), jnp.ones(1))
+    y0 = (H.scaling.beta(jnp.array(1.0))[None], jnp.ones(1))
     t, q, p = trajectory(H, dps.BlanesMoan4(), 1.0, 3.0, 0.05, y0)
     assert_close(q[:, 0], beta(jnp.array(t)), 1e-6)
     assert_close(p, np.ones_like(p), 1e-6)

@@ -85,7 +85,7 @@ class Backward:
             at = _add(at, self.saves.pull_saved_output(i, at.t, at.state[0], bar))
         return at
 
-    def step(self, at: Position, start: PyTree | None = None) -> Position:
+    def step(self, at: Position, start: Any = None) -> Position:
         """One step back; `start` is the state at its start, if known."""
         n, system, solver = at.n - 1, self.system, self.solver
         span, moves = self.span(n), solver.moves(system)

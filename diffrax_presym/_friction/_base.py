@@ -3,10 +3,10 @@
 import abc
 
 import equinox as eqx
-from jaxtyping import Array, Bool, Inexact, PyTree, Real
+from jaxtyping import Array, ArrayLike, Bool, Inexact, PyTree, Real
 
 
-Time = Real[Array, ""]
+Time = Real[ArrayLike, ""]
 Scalar = Inexact[Array, ""]
 
 

@@ -138,7 +138,7 @@ class ConstantDamping(AbstractDamping):
         return cast_to(self.gamma, as_time(t))
 
     def integral(self, t: Time, h: Time, order: int) -> Scalar:
-        return h * expm1_ratio(-self.increment(t, h))
+        return as_time(h) * expm1_ratio(-self.increment(t, h))
 
     def response(self, t: Time, h: Time, order: int) -> Scalar:
         return self.integral(t, h, order)

@@ -91,7 +91,7 @@ class PolynomialScaling(AbstractScaling):
         return c * C * t ** (c - 1)
 
     def is_valid(self, t: Time) -> Bool[Array, ""] | None:
-        return t > 0
+        return as_time(t) > 0
 
 
 class ExponentialScaling(AbstractScaling):
