@@ -106,6 +106,10 @@ class View(eqx.Module):
     def force(self, t, y: State):
         return self._stored(self.hamiltonian.force(t, *y, self.args), t, y)
 
+    def velocity_and_force(self, t, y: State) -> State:
+        velocity, force = self.hamiltonian.velocity_and_force(t, *y, self.args)
+        return velocity, self._stored(force, t, y)
+
     def potential_force(self, t, y: State):
         """The force that a splitting kicks with."""
         return self._stored(self.hamiltonian.potential_force(t, *y, self.args), t, y)
@@ -137,8 +141,11 @@ class View(eqx.Module):
     def slope(self, t, y: State, force=None) -> State:
         """The full vector field, of which the force may be known already."""
         damping = self.hamiltonian.damping
-        force = self.force(t, y) if force is None else force
-        return self.velocity(t, y), add_friction(damping, t, force, y[1])
+        if force is None:
+            velocity, force = self.velocity_and_force(t, y)
+        else:
+            velocity = self.velocity(t, y)
+        return velocity, add_friction(damping, t, force, y[1])
 
     def bend(self, t, y: State, slope: State) -> State:
         """The rate of change of the slope along the flow, the second derivative."""

@@ -52,6 +52,15 @@ class AbstractHamiltonian(eqx.Module):
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         r"""The force $-\partial E / \partial q$, without the friction."""
 
+    def velocity_and_force(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> tuple[Q, P]:
+        """Both at once, for schemes that need them at the same place.
+
+        Overridden where the two have much in common, which XLA finds only in part.
+        """
+        return self.velocity(t, q, p, args), self.force(t, q, p, args)
+
     @property
     @abc.abstractmethod
     def is_split(self) -> bool:

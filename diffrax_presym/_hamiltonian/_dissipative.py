@@ -59,6 +59,11 @@ class _AbstractDamped(AbstractHamiltonian):
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         return self.undamped.force(t, q, p, args)
 
+    def velocity_and_force(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> tuple[Q, P]:
+        return self.undamped.velocity_and_force(t, q, p, args)
+
     def is_valid(self, t, q, p, args=None):
         return self.undamped.is_valid(t, q, p, args)
 

@@ -193,6 +193,14 @@ class Hamiltonian(AbstractHamiltonian):
             return jtu.tree_map(jnp.negative, slope)
         return match(self.force_fn(t, q, p, args), q, "`force`", "`q`")
 
+    def velocity_and_force(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> tuple[Q, P]:
+        if self.velocity_fn is None and self.force_fn is None:
+            slopes = jax.grad(self.energy, argnums=(1, 2))(t, q, p, args)
+            return slopes[1], jtu.tree_map(jnp.negative, slopes[0])
+        return self.velocity(t, q, p, args), self.force(t, q, p, args)
+
     def is_valid(self, t, q, p, args=None):
         return all_finite((q, p))
 

@@ -178,7 +178,11 @@ class LagrangianSystem(AbstractHamiltonian):
         return self.to_velocity(t, q, p, args)
 
     def force(self, t: Time, q: _Vector, p: _Vector, args: PyTree = None) -> _Vector:
-        # The same factorisation as that of `velocity`: a compiler finds it only once.
+        return self.velocity_and_force(t, q, p, args)[1]
+
+    def velocity_and_force(
+        self, t: Time, q: _Vector, p: _Vector, args: PyTree = None
+    ) -> tuple[_Vector, _Vector]:
         v = self.to_velocity(t, q, p, args)
 
         def lagrangian(q):
@@ -191,7 +195,7 @@ class LagrangianSystem(AbstractHamiltonian):
         if self.force_fn is not None:
             value = self.force_fn(t, q, v, args)
             force = force + match(value, q, "`force`", "`q`")
-        return force
+        return v, force
 
     def _potential(self, t, q, args):
         return cast_to(scalar_fn(self.potential, "The potential")(t, q, args), q)
