@@ -100,9 +100,8 @@ def many_ends(solver, n):
         sol: Any = solve(FORCED, solver, 0.0, 6.0, dt0, (q, p), max_steps=None)
         return flat(sol.ys)
 
-    return jax.vmap(jax.vmap(one, (0, 0, None)), (None, None, 0))(
-        STARTS[0], STARTS[1], n
-    )
+    each_start = jax.vmap(one, (0, 0, None))
+    return jax.vmap(each_start, (None, None, 0))(STARTS[0], STARTS[1], n)
 
 
 _slow = lambda s: pytest.param(s, marks=pytest.mark.slow)
@@ -490,7 +489,8 @@ def test_gradients_do_not_depend_on_the_number_of_iterations():
     assert "while" in str(jaxpr) and "scan" not in str(jaxpr)
 
 
-@pytest.mark.parametrize("dense", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("dense", [False, True])
 def test_gradients_of_joint_friction(dense):
     saveat = dfx.SaveAt(ts=TS) if dense else dfx.SaveAt(t1=True)
 

@@ -138,8 +138,8 @@ def _round(x: Any) -> np.ndarray:
 class CollocationInterpolation(dfx.AbstractLocalInterpolation):
     """The polynomial of a step whose slopes are those of its stages and its two ends.
 
-    Exact at both ends, and its slopes there are too. With s stages, which lie on it to
-    order s + 1, its error between the ends is of order s + 2 in the length of the step.
+    Exact at both ends. With s stages, its error between the ends is of order s + 2 in
+    the length of the step; with one stage it is cubic Hermite interpolation.
     """
 
     t0: PyTree
