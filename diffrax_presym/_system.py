@@ -71,13 +71,22 @@ class System(eqx.Module):
         y = values(y)
         return _stored(self.hamiltonian.force(t, *y, self.args), t, y)
 
+    def velocity_and_force(self, t: Time, y: State) -> State:
+        """The vector field without friction."""
+        q, p = y = values(y)
+        velocity, force = self.hamiltonian.velocity_and_force(t, q, p, self.args)
+        return velocity, _stored(force, t, y)
+
     def slope(self, t: Time, y: State, force: PyTree | None = None) -> State:
-        """The full vector field, friction included; `force` may be given."""
+        """The full vector field, with friction. Reuses a given force."""
         y = values(y)
-        force = self.force(t, y) if force is None else force
+        if force is None:
+            velocity, force = self.velocity_and_force(t, y)
+        else:
+            velocity = self.velocity(t, y)
         if self.friction is not None:
             force = self.friction.net_force(t, force, y[1])
-        return self.velocity(t, y), force
+        return velocity, force
 
     def second_derivative(self, t: Time, y: State, slope: State) -> State:
         """The derivative of the vector field along the motion."""

@@ -13,6 +13,7 @@ from ._kinetic import (
     QuadraticKinetic as QuadraticKinetic,
     RelativisticKinetic as RelativisticKinetic,
 )
+from ._lagrangian import LagrangianSystem as LagrangianSystem
 from ._mirror import (
     AbstractMirrorMap as AbstractMirrorMap,
     EntropyMirror as EntropyMirror,

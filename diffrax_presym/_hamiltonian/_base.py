@@ -51,6 +51,15 @@ class AbstractHamiltonian(eqx.Module):
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         r"""The force $-\partial E / \partial q$, without the friction."""
 
+    def velocity_and_force(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> tuple[Q, P]:
+        """Both at once, for schemes that need them at the same place.
+
+        Overridden if the two share computations that XLA does not find.
+        """
+        return self.velocity(t, q, p, args), self.force(t, q, p, args)
+
     @abc.abstractmethod
     def kinetic_flow(
         self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8

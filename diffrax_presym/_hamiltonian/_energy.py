@@ -87,6 +87,9 @@ class SeparableEnergy(eqx.Module):
             slope = jax.grad(potential, argnums=1)(t, q, args)
         return jtu.tree_map(jnp.negative, slope)
 
+    def velocity_and_force(self, t: Time, q: Q, p: P, args: PyTree) -> tuple[Q, P]:
+        return self.velocity(t, q, p, args), self.force(t, q, p, args)
+
     def splits(self, damping: AbstractDamping | None) -> tuple[AbstractSplit, ...]:
         kinetic = self.kinetic if self.velocity_fn is None else None
         nystrom = kinetic is not None and kinetic.is_quadratic
@@ -137,6 +140,12 @@ class GeneralEnergy(eqx.Module):
             return jtu.tree_map(jnp.negative, slope)
         return match(self.force_fn(t, q, p, args), q, "`force`", "`q`")
 
+    def velocity_and_force(self, t: Time, q: Q, p: P, args: PyTree) -> tuple[Q, P]:
+        if self.velocity_fn is not None or self.force_fn is not None:
+            return self.velocity(t, q, p, args), self.force(t, q, p, args)
+        slopes = jax.grad(self.__call__, argnums=(1, 2))(t, q, p, args)
+        return slopes[1], jtu.tree_map(jnp.negative, slopes[0])
+
     def splits(self, damping: AbstractDamping | None) -> tuple[AbstractSplit, ...]:
         return ()
 
@@ -164,6 +173,11 @@ class AbstractMechanicalHamiltonian(AbstractHamiltonian):
 
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         return self.E.force(t, q, p, args)
+
+    def velocity_and_force(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> tuple[Q, P]:
+        return self.E.velocity_and_force(t, q, p, args)
 
     @property
     def splits(self) -> tuple[AbstractSplit, ...]:

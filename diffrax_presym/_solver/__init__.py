@@ -1,5 +1,6 @@
 from ._base import AbstractPresymplecticSolver as AbstractPresymplecticSolver
 from ._checked import Checked as Checked
+from ._collocation import CollocationInterpolation as CollocationInterpolation
 from ._compensated import Compensated as Compensated
 from ._composition import (
     Composition as Composition,
@@ -16,6 +17,7 @@ from ._coupled import (
     PresymplecticProjected as PresymplecticProjected,
 )
 from ._euler import PresymplecticEuler as PresymplecticEuler
+from ._gauss import PresymplecticGauss as PresymplecticGauss
 from ._leapfrog import PresymplecticLeapfrog as PresymplecticLeapfrog
 from ._midpoint import PresymplecticMidpoint as PresymplecticMidpoint
 from ._splitting import (

@@ -1,0 +1,171 @@
+"""Tables of Gauss collocation, to the last digit of a double."""
+
+import functools
+from collections.abc import Callable
+from decimal import Decimal, localcontext
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import PyTree
+
+from .._misc import cast_to
+
+
+MAX_STAGES = 8
+_DIGITS = 60
+
+
+class GaussTable(NamedTuple):
+    r"""Gauss collocation on $[0, 1]$; see section II.1.3 of Hairer, Lubich, Wanner.
+
+    Polynomials are written in the Legendre polynomials $P_k$ shifted to $[0, 1]$. With
+    the discrete orthogonality of these at the nodes, the Lagrange polynomials are
+    $\ell_j(x) = b_j \sum_k (2k + 1) P_k(c_j) P_k(x)$.
+    """
+
+    nodes: np.ndarray  # c
+    weights: np.ndarray  # b
+    # a_ij / b_j. A row and a column of it add up to one exactly, mu_ij + mu_ji = 1:
+    # that is what makes the scheme symplectic, also in floating point.
+    mu: np.ndarray
+    # Row k is (2k + 1) P_k(c_j): from slopes times weights to Legendre coefficients.
+    project: np.ndarray
+    # From the slopes at 0, the nodes and 1 to the Legendre coefficients of their
+    # polynomial, from that of P_1 on.
+    dense: np.ndarray
+
+
+def legendre(count: int, x: Any) -> list:
+    """The first Legendre polynomials on [-1, 1], by their three-term recurrence."""
+    values = [1 + 0 * x, x]
+    for k in range(1, count - 1):
+        values.append(((2 * k + 1) * x * values[k] - k * values[k - 1]) / (k + 1))
+    return values[:count]
+
+
+@functools.cache
+def gauss_table(stages: int) -> GaussTable:
+    """The table of so many stages.
+
+    Computed in 60 decimal digits and rounded once. `numpy.polynomial.legendre.leggauss`
+    is right to a few units in the last place.
+    """
+    with localcontext() as context:
+        context.prec = _DIGITS
+        points = [_root(stages, guess) for guess in _guesses(stages)]
+        # Exactly antisymmetric, the middle one exactly zero.
+        points = [(a - b) / 2 for a, b in zip(points, points[::-1], strict=True)]
+        values = [legendre(stages + 1, x) for x in points]
+        slopes = [
+            stages * (x * p[stages] - p[stages - 1]) / (x * x - 1)
+            for x, p in zip(points, values, strict=True)
+        ]
+        weights = [
+            1 / ((1 - x * x) * s * s) for x, s in zip(points, slopes, strict=True)
+        ]
+        project = [[(2 * k + 1) * p[k] for p in values] for k in range(stages)]
+        mu = _matrix(
+            lambda i, j: (
+                (1 + points[i]) / 2
+                + sum(
+                    values[j][k] * (values[i][k + 1] - values[i][k - 1]) / 2
+                    for k in range(1, stages)
+                )
+            ),
+            stages,
+        )
+        at_nodes = [[row[j] * weights[j] for j in range(stages)] for row in project]
+        nodes = _round([(1 + x) / 2 for x in points])
+        rounded = _round(mu)
+        # The larger of two that add up to one is rounded, the other is exact.
+        lower = np.tril(rounded, -1)
+        upper = np.triu(1 - rounded.T, 1)
+        exact = lower + upper + np.eye(stages) / 2
+        dense = _round(_with_ends(at_nodes))
+        return GaussTable(nodes, _round(weights), exact, _round(project), dense)
+
+
+def _with_ends(at_nodes: list[list[Decimal]]) -> list[list[Decimal]]:
+    """The Legendre coefficients of the polynomial through the nodes and both ends.
+
+    To the polynomial p through the nodes it adds
+    P_s ((-1)^s (f_0 - p(0)) (1 - x) + (f_1 - p(1)) x), which is zero at all of them.
+    """
+    stages = len(at_nodes)
+    sign = Decimal((-1) ** stages)
+    zero, one = Decimal(0), Decimal(1)
+    rows = [[zero, *row, zero] for row in at_nodes]
+    columns = range(stages + 2)
+    left = [sum(((-1) ** k * rows[k][j] for k in range(stages)), zero) for j in columns]
+    right = [sum((rows[k][j] for k in range(stages)), zero) for j in columns]
+    left = [sign * ((one if j == 0 else zero) - left[j]) for j in columns]
+    right = [(one if j == stages + 1 else zero) - right[j] for j in columns]
+    even = [(a + b) / 2 for a, b in zip(left, right, strict=True)]
+    odd = [(b - a) / 2 for a, b in zip(left, right, strict=True)]
+    if stages == 1:
+        # The mean is known better than by the slope at the middle.
+        return [even, odd]
+    low, high = (Decimal(n) / (2 * stages + 1) for n in (stages, stages + 1))
+    rows[-1] = [a + low * b for a, b in zip(rows[-1], odd, strict=True)]
+    return [*rows[1:], even, [high * b for b in odd]]
+
+
+def _guesses(stages: int) -> list[Decimal]:
+    points, _ = np.polynomial.legendre.leggauss(stages)
+    return [Decimal(float(x)) for x in points]
+
+
+def _root(stages: int, x: Decimal) -> Decimal:
+    # Each iteration doubles the digits, of which there are 15 to begin with.
+    for _ in range(3):
+        p = legendre(stages + 1, x)
+        x -= p[stages] * (x * x - 1) / (stages * (x * p[stages] - p[stages - 1]))
+    return x
+
+
+def _matrix(entry: Callable, size: int) -> list[list[Decimal]]:
+    return [[entry(i, j) for j in range(size)] for i in range(size)]
+
+
+def _round(x: Any) -> np.ndarray:
+    # From decimal to the nearest double.
+    return np.vectorize(float, otypes=[float])(np.array(x, dtype=object))
+
+
+class CollocationInterpolation(dfx.AbstractLocalInterpolation):
+    """The polynomial of a step whose slopes are those of its stages and its two ends.
+
+    Exact at both ends. With s stages, its error between the ends is of order s + 2 in
+    the length of the step; with one stage it is cubic Hermite interpolation.
+    """
+
+    t0: PyTree
+    t1: PyTree
+    y0: PyTree
+    y1: PyTree
+    # Legendre coefficients of the slope, times the length of the step, from P_1 on.
+    slopes: PyTree
+
+    def evaluate(self, t0, t1=None, left: bool = True) -> PyTree:
+        del left
+        if t1 is not None:
+            start, end = self.evaluate(t0), self.evaluate(t1)
+            return jtu.tree_map(lambda a, b: b - a, start, end)
+        # A step of no length, as in an empty solve, is all start.
+        length = self.t1 - self.t0
+        empty = length == 0
+        s = jnp.where(empty, 0, (t0 - self.t0) / jnp.where(empty, 1, length))
+
+        def leaf(y0, y1, slopes):
+            x = cast_to(s, y0)
+            p = legendre(len(slopes) + 2, 2 * x - 1)
+            y = (1 - x) * y0 + x * y1
+            # The integrals of the Legendre polynomials from the start.
+            for k, slope in enumerate(slopes, 1):
+                y = y + (p[k + 1] - p[k - 1]) / (4 * k + 2) * slope
+            return y
+
+        return jtu.tree_map(leaf, self.y0, self.y1, self.slopes)

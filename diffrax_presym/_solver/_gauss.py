@@ -1,0 +1,507 @@
+from typing import Any, ClassVar, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import lineax as lx
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Inexact, PyTree, Shaped
+
+from .._misc import (
+    cast_to,
+    check_root_finder,
+    Sum,
+    tree_add,
+    tree_scale,
+    tree_sub,
+    tree_sum,
+)
+from .._split import State
+from .._system import System
+from ._base import AbstractPresymplecticSolver
+from ._collocation import (
+    CollocationInterpolation,
+    gauss_table,
+    GaussTable,
+    legendre,
+    MAX_STAGES,
+)
+
+
+# Velocities and forces of all stages, times weight and length of the step, the forces
+# in the frame of its middle.
+Slopes = PyTree[Shaped[Array, "stages ..."]]
+# Positions and momenta of all stages, in that frame.
+Stages = PyTree[Shaped[Array, "stages ..."]]
+
+
+class _Carry(NamedTuple):
+    """What a step leaves to the next."""
+
+    lost: State  # what rounding has taken from the state so far
+    slopes: Slopes  # of the last step, for the first guess
+    h: Inexact[Array, ""]  # the length of the last step, zero if there was none
+
+
+class PresymplecticGauss(AbstractPresymplecticSolver[_Carry]):
+    r"""Gauss collocation, in the frame that moves with the momentum.
+
+    Order 2 to 16, twice the number of stages, and symmetric. Implicit for every
+    Hamiltonian: a step takes one evaluation of velocity and force for all stages at
+    once, by `jax.vmap`, in each of 3 to 15 iterations. Uses
+    [`diffrax_presym.CollocationInterpolation`][] for dense/ts output, with an error of
+    order `stages + 2` between the steps, at the cost of two more evaluations.
+
+    For Hamiltonians that are neither separable nor split, and for mechanics with a mass
+    matrix, [`diffrax_presym.LagrangianSystem`][]. Conformally symplectic to rounding:
+    with friction of log scale $\eta$ the Jacobian of a step satisfies
+    $J^\top \Omega J = e^{\eta(t_0) - \eta(t_1)} \Omega$. All quadratic invariants are
+    preserved too. Six to eight stages and long steps for errors of 1e-9 and less.
+    Separable and split Hamiltonians have explicit schemes, which cost less.
+
+    The iteration is repeated until its changes stop to decrease, so that what is left
+    is rounding of no preferred sign, and the update of the state is a compensated sum:
+    over long times the error of the energy is a random walk of rounding errors. The
+    `solver_state` holds what the sum has lost and the slopes of the last step, which
+    are extrapolated to the next for a first guess.
+
+    The fixed-point iteration, the default, converges for a step times the largest
+    frequency of the system below about one to two. A step for which it does not
+    converge fails with a `RESULTS`. For stiff energies pass a root finder.
+
+    Derivatives are those of the implicit function, not of the iterations, in forward
+    and in reverse mode; [`diffrax_presym.ReversibleAdjoint`][] takes gradients in
+    constant memory.
+
+    ??? cite "Reference"
+
+        Section II.1.3 and chapter VIII of Hairer, Lubich and Wanner, see the
+        references. Stopping rule, coefficients and sums are after
+
+        ```bibtex
+        @article{antonana2017reducing,
+            author={Anto{\~n}ana, Mikel and Makazaga, Joseba and Murua, Ander},
+            title={Reducing and monitoring round-off error propagation for symplectic
+                   implicit {R}unge--{K}utta schemes},
+            journal={Numerical Algorithms},
+            volume={76},
+            number={4},
+            pages={861--880},
+            year={2017},
+        }
+
+        @article{hairer2008achieving,
+            author={Hairer, Ernst and McLachlan, Robert I. and Razakarivony, Alain},
+            title={Achieving {B}rouwer's law with implicit {R}unge--{K}utta methods},
+            journal={BIT Numerical Mathematics},
+            volume={48},
+            number={2},
+            pages={231--243},
+            year={2008},
+        }
+        ```
+
+        and the evaluation of all stages at once after
+
+        ```bibtex
+        @misc{antonana2025simd,
+            author={Anto{\~n}ana, Mikel and Makazaga, Joseba and Murua, Ander},
+            title={{SIMD}-vectorized implicit symplectic integrators can outperform
+                   explicit symplectic ones},
+            year={2025},
+            eprint={2511.03655},
+            archivePrefix={arXiv},
+        }
+        ```
+    """
+
+    stages: int = eqx.field(static=True)
+    root_finder: optx.AbstractRootFinder | None
+    max_iterations: int = eqx.field(static=True)
+    interpolation_cls: ClassVar = CollocationInterpolation
+
+    def __init__(
+        self,
+        stages: int = 4,
+        root_finder: optx.AbstractRootFinder | None = None,
+        max_iterations: int = 100,
+    ):
+        """**Arguments:**
+
+        - `stages`: the number of stages, 1 to 8; the order is twice as high. Defaults
+            to 4. One stage is the implicit midpoint rule.
+        - `root_finder`: an Optimistix root finder for the equations of the stages, for
+            example `optimistix.Newton(rtol=1e-10, atol=1e-10)`, which solves a dense
+            linear system of all stages. Its tolerances bound how well the structure is
+            preserved. Defaults to `None`, fixed-point iteration to rounding.
+        - `max_iterations`: the most iterations a step may take, of fixed-point
+            iteration or root finder. Defaults to 100.
+
+        **Raises:**
+
+        `ValueError` if a number is out of range, or `root_finder` of the wrong kind. A
+        step whose iteration does not converge makes the solve fail, with
+        `RESULTS.nonlinear_max_steps_reached`, or with `RESULTS.nonlinear_divergence` if
+        it leaves the finite numbers.
+        """
+        _check_number(stages, MAX_STAGES, "`PresymplecticGauss(stages)`")
+        if root_finder is not None:
+            check_root_finder(root_finder)
+        self.stages = stages
+        self.root_finder = root_finder
+        _check_number(max_iterations, None, "`PresymplecticGauss(max_iterations=...)`")
+        self.max_iterations = max_iterations
+
+    @property
+    def is_symmetric(self) -> bool:
+        return True
+
+    def order(self, terms):
+        return 2 * self.stages
+
+    def start(self, system: System, t: Array, y: State) -> _Carry:
+        y = system.values(y)
+        many = lambda x: jnp.zeros((self.stages, *jnp.shape(x)), jnp.result_type(x))
+        lost, slopes = jtu.tree_map(jnp.zeros_like, y), jtu.tree_map(many, y)
+        return _Carry(lost, slopes, jnp.zeros((), jnp.result_type(t)))
+
+    def advance(
+        self, system: System, t0: Array, t1: Array, h: Array, y: State, carry: _Carry
+    ) -> tuple[State, _Carry, dfx.RESULTS]:
+        # Within `Compensated` the leaves are sums already.
+        sums = jtu.tree_map(
+            lambda x, lost: x if _is_sum(x) else Sum(x, lost),
+            *(y, carry.lost),
+            is_leaf=_is_sum,
+        )
+        value, lost = _part(sums, "value"), _part(sums, "lost")
+        step = _Step(system, gauss_table(self.stages), t0, h, value, lost)
+        guess = step.extrapolate(carry.slopes, carry.h)
+        slopes, result = self._solve(step, guess)
+        sums = system.add(sums, 1, step.change(slopes))
+        y = jtu.tree_map(
+            lambda x, new: new if _is_sum(x) else new.value,
+            *(y, sums),
+            is_leaf=_is_sum,
+        )
+        # The solution depends on none of it, except by rounding.
+        carry = _Carry(_part(sums, "lost"), slopes, cast_to(h, carry.h))
+        return y, lax.stop_gradient(carry), result
+
+    def _solve(self, step: "_Step", guess: Slopes) -> tuple[Slopes, dfx.RESULTS]:
+        if self.root_finder is None:
+            find = lambda guess: _iterate(step, guess, self.max_iterations)
+        else:
+            finder = self.root_finder
+            find = lambda guess: _find_root(step, guess, finder, self.max_iterations)
+        return _implicit(step, find, guess, self._tangent)
+
+    @property
+    def _tangent(self):
+        return _contract if self.root_finder is None else _factorise
+
+    def slope(self, system: System, t, y: State, carry: _Carry) -> State:
+        return system.slope(t, y)
+
+    def dense_info(self, system: System, t0, t1, h, start, end) -> dict[str, PyTree]:
+        (y0, carry0), (y1, carry1) = start, end
+        step = _Step(system, gauss_table(self.stages), t0, h, y0, carry0.lost)
+        # On the way back of a gradient the step was last solved from its end.
+        back = carry1.h * h < 0
+        flip = lambda x0, x1: jnp.where(back, -x0[::-1], x1)
+        slopes = jtu.tree_map(flip, carry0.slopes, carry1.slopes)
+        known = lambda slopes: (slopes, None)
+        slopes, _ = _implicit(step, known, slopes, self._tangent)
+        k0 = tree_scale(h, self.slope(system, t0, y0, carry0))
+        k1 = tree_scale(h, self.slope(system, t1, y1, carry1))
+        return dict(y0=y0, y1=y1, slopes=step.dense(slopes, k0, k1))
+
+
+_is_sum = lambda x: isinstance(x, Sum)
+
+
+def _part(sums: PyTree, name: str) -> PyTree:
+    return jtu.tree_map(lambda s: getattr(s, name), sums, is_leaf=_is_sum)
+
+
+def _check_number(x, most: int | None, name: str) -> None:
+    # `True` is an integer too.
+    if type(x) is not int or x < 1 or (most is not None and x > most):
+        wanted = "at least 1" if most is None else f"from 1 to {most}"
+        raise ValueError(f"{name} must be a Python integer {wanted}, but got {x!r}.")
+
+
+class _Step:
+    """The equations of the stages of one step."""
+
+    def __init__(self, system: System, table: GaussTable, t0, h, y: State, lost: State):
+        self.system, self.table = system, table
+        self.t0, self.h, self.y, self.lost = t0, h, y, lost
+        self.middle = t0 + h / 2
+        # The times of the stages, and from there to the middle.
+        self.times = t0 + cast_to(table.nodes, h) * h
+        self.to_middle = cast_to(1 / 2 - table.nodes, h) * h
+        self.weights = cast_to(table.weights, h) * h
+        to_frame = lambda y: (y[0], system.move_frame(t0, h / 2, y[1]))
+        self.base, self.base_lost = to_frame(y), to_frame(lost)
+
+    def extrapolate(self, slopes: Slopes, last_h) -> Slopes:
+        """A first guess, from the slopes of the step before, which was so long."""
+        q, p = slopes
+        half = last_h / 2
+        forward = lambda p: self.system.move_frame(self.t0 - half, half + self.h / 2, p)
+        ratio = self.h / jnp.where(last_h == 0, 1, last_h)
+        # A polynomial is no guess far from where it was found.
+        ratio = jnp.where(jnp.abs(ratio) < 2, ratio, 0)
+        nodes = cast_to(self.table.nodes, ratio)
+        ahead = jnp.stack(legendre(max(2, len(nodes)), 1 + 2 * ratio * nodes))
+        project = cast_to(self.table.project, ratio)
+        weights = ratio * cast_to(self.table.weights, ratio)
+        matrix = weights[:, None] * _dot(ahead[: len(nodes)].T, project)
+        return jtu.tree_map(lambda x: _dot(matrix, x), (q, jax.vmap(forward)(p)))
+
+    def stages(self, slopes: Slopes) -> Stages:
+        # What is small is added first.
+        gained = jtu.tree_map(lambda x: _dot(self.table.mu, x), slopes)
+        add = lambda y, lost, x: y[None] + (lost[None] + x)
+        return jtu.tree_map(add, self.base, self.base_lost, gained)
+
+    def slopes(self, stages: Stages) -> Slopes:
+        system = self.system
+
+        def one(t, to_middle, weight, q, p):
+            p = system.move_frame(self.middle, -to_middle, p)
+            velocity, force = system.velocity_and_force(t, (q, p))
+            force = system.move_frame(t, to_middle, force)
+            return tree_scale(weight, (velocity, force))
+
+        return jax.vmap(one)(self.times, self.to_middle, self.weights, *stages)
+
+    def residual(self, slopes: Slopes) -> Slopes:
+        return tree_sub(self.slopes(self.stages(slopes)), slopes)
+
+    def change(self, slopes: Slopes) -> State:
+        """The change of the state over the step."""
+        q, p = jtu.tree_map(lambda x: jnp.sum(x, axis=0), slopes)
+        p = self.system.move_frame(self.middle, self.h / 2, p)
+        friction = self.system.friction
+        if friction is not None:
+            p = tree_add(p, 1, friction.decay(self.t0, self.h, self.y[1]))
+        return q, p
+
+    def dense(self, slopes: Slopes, k0: State, k1: State) -> PyTree:
+        """The Legendre coefficients of the slope of the mechanical momentum."""
+        friction = self.system.friction
+
+        def one(t, to_middle, weight, stage, slope):
+            (_, p), (velocity, force) = stage, slope
+            velocity, force = tree_scale(1 / weight, (velocity, force))
+            if friction is not None:
+                back = lambda p: self.system.move_frame(self.middle, -to_middle, p)
+                momentum = tree_scale(self.h, back(p))
+                force = friction.net_force(t, back(force), momentum)
+            return velocity, force
+
+        weights = cast_to(self.table.weights, self.h)
+        stages = self.stages(slopes)
+        inner = jax.vmap(one)(self.times, self.to_middle, weights, stages, slopes)
+
+        def leaf(k0, inner, k1):
+            all_slopes = jnp.concatenate([k0[None], inner, k1[None]])
+            return _dot(self.table.dense, all_slopes)
+
+        return jtu.tree_map(leaf, k0, inner, k1)
+
+
+def _dot(matrix, x):
+    return jnp.tensordot(cast_to(matrix, x), x, 1, precision=lax.Precision.HIGHEST)
+
+
+def _implicit(step: _Step, find, guess: Slopes, tangent):
+    """The slopes that are found, with the derivatives of the implicit function.
+
+    `find` returns them and a result.
+    """
+
+    def as_float(residual, guess):
+        slopes, result = find(guess)
+        # `custom_root` gives integers a derivative of the wrong type.
+        code, kind = jtu.tree_flatten(result)
+        kinds.append(kind)
+        return slopes, [jnp.asarray(x, jnp.float32) for x in code]
+
+    kinds = []
+    slopes, code = lax.custom_root(
+        step.residual, guess, as_float, tangent, has_aux=True
+    )
+    code = [lax.stop_gradient(x).astype(jnp.int32) for x in code]
+    return slopes, jtu.tree_unflatten(kinds[-1], code)
+
+
+class _Search(NamedTuple):
+    """Where a fixed-point iteration stands."""
+
+    stages: Stages
+    slopes: Slopes
+    # One array, as XLA would make a kernel for each number. Changes are those of the
+    # stages, in units of their rounding.
+    record: Inexact[Array, "7"]
+
+
+# What is in the record.
+_STATUS = 0  # of the search, one of the following
+_GOING, _CONVERGED, _FAILED = 0, 1, 2
+_COUNT = 1  # of iterations
+_LAST, _BEFORE = 2, 3  # change, and the one before
+_LEAST = 4  # change so far
+_STALLED = 5  # how often in a row it was none less
+_FRESH = 6  # whether begun without a guess
+
+
+# Of the change that one more iteration would make, in units of rounding.
+_NEGLIGIBLE = 1e-3
+# The change at which an iteration that goes round in a circle does so by rounding.
+_ROUNDING = 16.0
+
+
+def _iterate(step: _Step, guess: Slopes, max_iterations: int):
+    """Fixed-point iteration to rounding.
+
+    It ends where its changes stop to decrease, so that what is left is rounding, of
+    either sign. Any other tolerance leaves an error that has a direction in time.
+    """
+    dtype = step.h.dtype
+    number = lambda x: jnp.asarray(x, dtype)
+    nothing = jtu.tree_map(jnp.zeros_like, guess)
+    loose = float(jnp.finfo(_lowest(guess)).eps) ** (-1 / 3)
+
+    def iterate(search: _Search) -> _Search:
+        _, count, last, before, least, stalled, fresh = search.record
+        slopes = step.slopes(search.stages)
+        stages = step.stages(slopes)
+        q, p = (_change(*x, dtype) for x in zip(stages, search.stages, strict=True))
+        change = jnp.maximum(q, p)
+        # Positions and momenta may each depend on the other alone, so that changes
+        # decrease over two iterations.
+        rate = jnp.maximum(change / last, last / before)
+        stalled = jnp.where(change < least, 0, stalled + 1)
+        # What is at rest is all rounding, relative to itself.
+        converged = (
+            (change == 0)
+            | (rate * change <= _NEGLIGIBLE)
+            | ((stalled > 0) & (change <= _ROUNDING))
+            | ((stalled >= 3) & (jnp.minimum(q, p) <= loose))
+        )
+        # A guess may be outside of the domain where the state is not.
+        finite = jnp.isfinite(change)
+        restart = ~finite & (fresh == 0)
+        failed = jnp.where(finite | restart, _GOING, _FAILED)
+        status = jnp.where(converged, _CONVERGED, failed)
+        least = jnp.minimum(change, least)
+        start = lambda x, y: jtu.tree_map(lambda x, y: jnp.where(restart, x, y), x, y)
+        record = start(
+            [_GOING, count + 1, 0, 0, jnp.inf, 0, 1],
+            [status, count + 1, change, last, least, stalled, fresh],
+        )
+        record = jnp.stack([number(x) for x in record])
+        return _Search(start(step.stages(nothing), stages), slopes, record)
+
+    def going(search: _Search):
+        record = search.record
+        return (record[_STATUS] == _GOING) & (record[_COUNT] < max_iterations)
+
+    record = np.zeros(7)
+    record[_LEAST] = np.inf
+    search = _Search(step.stages(guess), guess, number(record))
+    search = lax.while_loop(going, iterate, search)
+    status = search.record[_STATUS]
+    results: Any = dfx.RESULTS
+    failure = results.where(
+        status == _FAILED,
+        results.nonlinear_divergence,
+        results.nonlinear_max_steps_reached,
+    )
+    converged = status == _CONVERGED
+    return search.slopes, results.where(converged, results.successful, failure)
+
+
+def _find_root(step: _Step, guess: Slopes, root_finder, max_iterations: int):
+    nothing = jtu.tree_map(jnp.zeros_like, guess)
+    # Extrapolated, what is stiff may be far off.
+    sizes = (_largest(step.residual(x)) for x in (guess, nothing))
+    better = jnp.less(*sizes)
+    guess = jtu.tree_map(lambda x: jnp.where(better, x, 0), guess)
+    solution = optx.root_find(
+        lambda slopes, _: step.residual(slopes),
+        root_finder,
+        guess,
+        max_steps=max_iterations,
+        throw=False,
+    )
+    return solution.value, dfx.RESULTS.promote(solution.result)
+
+
+def _lowest(x: PyTree):
+    """The lowest precision of the leaves."""
+    dtypes = [leaf.dtype for leaf in jtu.tree_leaves(x)]
+    return max(dtypes, key=lambda dtype: float(jnp.finfo(dtype).eps))
+
+
+def _change(x: PyTree, y: PyTree, dtype) -> Inexact[Array, ""]:
+    """The largest difference, in units of the rounding of the largest entry."""
+
+    def leaf(x, y):
+        info = jnp.finfo(x.dtype)
+        size = float(info.eps) * jnp.max(jnp.abs(x), initial=0)
+        change = jnp.max(jnp.abs(x - y), initial=0)
+        return cast_to(change / jnp.maximum(size, float(info.tiny)), dtype)
+
+    return jtu.tree_reduce(jnp.maximum, jtu.tree_map(leaf, x, y), jnp.zeros((), dtype))
+
+
+def _largest(x: PyTree) -> Inexact[Array, ""]:
+    sizes = jtu.tree_map(lambda x: jnp.max(jnp.abs(x), initial=0), x)
+    with jax.numpy_dtype_promotion("standard"):
+        return jtu.tree_reduce(jnp.maximum, sizes)
+
+
+def _contract(g, y: Slopes) -> Slopes:
+    """Solve a linear system of a residual by the same iteration."""
+
+    def solve(g, b):
+        # x = x + g(x) - b
+        def iterate(state):
+            x, _, least, stalled, count = state
+            new = tree_sub(tree_sum(x, g(x)), b)
+            change, size = _largest(tree_sub(new, x)), _largest(new)
+            stalled = jnp.where(change < least, 0, stalled + 1)
+            going = (change > eps / 8 * size) & (stalled < 3)
+            return new, going, jnp.minimum(change, least), stalled, count + 1
+
+        start = tree_scale(-1, b)
+        eps = float(jnp.finfo(_lowest(b)).eps)
+        state = (
+            start,
+            jnp.array(True),
+            jnp.asarray(jnp.inf, _largest(b).dtype),
+            jnp.asarray(0),
+            jnp.asarray(0),
+        )
+        x, going, least, *_ = lax.while_loop(
+            lambda state: state[1] & (state[-1] < 200), iterate, state
+        )
+        # Never numbers as if nothing had happened.
+        solved = ~going & (least <= eps ** (1 / 2) * _largest(x))
+        return jtu.tree_map(lambda x: jnp.where(solved, x, jnp.nan), x)
+
+    return lax.custom_linear_solve(g, y, solve, transpose_solve=solve)
+
+
+def _factorise(g, y: Slopes) -> Slopes:
+    """The same by a factorisation of the matrix."""
+    operator = lx.FunctionLinearOperator(g, jax.eval_shape(lambda: y))
+    return lx.linear_solve(operator, y, lx.AutoLinearSolver(well_posed=True)).value
