@@ -136,7 +136,11 @@ def test_docstring_is_complete(name):
 
 
 # Records, whose fields the docstring of the class explains; made by no user.
-DOCUMENTED_AS_A_WHOLE = {"HermiteInterpolation", "SplittingTableau"}
+DOCUMENTED_AS_A_WHOLE = {
+    "CollocationInterpolation",
+    "HermiteInterpolation",
+    "SplittingTableau",
+}
 
 
 def test_references_resolve():
