@@ -41,10 +41,10 @@ Stages = PyTree[Shaped[Array, "stages ..."]]
 
 
 class _Carry(NamedTuple):
-    """What a step leaves to the next."""
+    """The solver state."""
 
-    lost: State  # what rounding has taken from the state so far
-    slopes: Slopes  # of the last step, for the first guess
+    lost: State  # the rounding error of the state so far
+    slopes: Slopes  # of the last step, for the initial guess
     h: Inexact[Array, ""]  # the length of the last step, zero if there was none
 
 
@@ -64,11 +64,11 @@ class PresymplecticGauss(AbstractPresymplecticSolver[_Carry]):
     preserved too. Six to eight stages and long steps for errors of 1e-9 and less.
     Separable and split Hamiltonians have explicit schemes, which cost less.
 
-    The iteration is repeated until its changes stop to decrease, so that what is left
-    is rounding of no preferred sign, and the update of the state is a compensated sum:
-    over long times the error of the energy is a random walk of rounding errors. The
-    `solver_state` holds what the sum has lost and the slopes of the last step, which
-    are extrapolated to the next for a first guess.
+    The iteration stops when its changes no longer decrease, so that the remaining error
+    is rounding without a preferred sign, and the state is updated by compensated
+    summation: over long times the energy error is a random walk of rounding errors. The
+    `solver_state` holds the rounding error of the sum and the slopes of the last step,
+    which are extrapolated to give the initial guess of the next.
 
     The fixed-point iteration, the default, converges for a step times the largest
     frequency of the system below about one to two. A step for which it does not
@@ -211,7 +211,7 @@ class PresymplecticGauss(AbstractPresymplecticSolver[_Carry]):
     def dense_info(self, system: System, t0, t1, h, start, end) -> dict[str, PyTree]:
         (y0, carry0), (y1, carry1) = start, end
         step = _Step(system, gauss_table(self.stages), t0, h, y0, carry0.lost)
-        # On the way back of a gradient the step was last solved from its end.
+        # In a gradient by reversal the step was last solved from its end.
         back = carry1.h * h < 0
         flip = lambda x0, x1: jnp.where(back, -x0[::-1], x1)
         slopes = jtu.tree_map(flip, carry0.slopes, carry1.slopes)
@@ -251,12 +251,12 @@ class _Step:
         self.base, self.base_lost = to_frame(y), to_frame(lost)
 
     def extrapolate(self, slopes: Slopes, last_h) -> Slopes:
-        """A first guess, from the slopes of the step before, which was so long."""
+        """An initial guess, from the slopes of the last step and its length."""
         q, p = slopes
         half = last_h / 2
         forward = lambda p: self.system.move_frame(self.t0 - half, half + self.h / 2, p)
         ratio = self.h / jnp.where(last_h == 0, 1, last_h)
-        # A polynomial is no guess far from where it was found.
+        # Do not extrapolate far beyond the last step.
         ratio = jnp.where(jnp.abs(ratio) < 2, ratio, 0)
         nodes = cast_to(self.table.nodes, ratio)
         ahead = jnp.stack(legendre(max(2, len(nodes)), 1 + 2 * ratio * nodes))
@@ -266,7 +266,7 @@ class _Step:
         return jtu.tree_map(lambda x: _dot(matrix, x), (q, jax.vmap(forward)(p)))
 
     def stages(self, slopes: Slopes) -> Stages:
-        # What is small is added first.
+        # Add the small terms first.
         gained = jtu.tree_map(lambda x: _dot(self.table.mu, x), slopes)
         add = lambda y, lost, x: y[None] + (lost[None] + x)
         return jtu.tree_map(add, self.base, self.base_lost, gained)
@@ -354,7 +354,7 @@ def _implicit(step: _Step, find, guess: Slopes, tangent):
 
 
 class _Search(NamedTuple):
-    """Where a fixed-point iteration stands."""
+    """The state of a fixed-point iteration."""
 
     stages: Stages
     slopes: Slopes
@@ -363,27 +363,27 @@ class _Search(NamedTuple):
     record: Inexact[Array, "7"]
 
 
-# What is in the record.
+# The entries of the record.
 _STATUS = 0  # of the search, one of the following
 _GOING, _CONVERGED, _FAILED = 0, 1, 2
 _COUNT = 1  # of iterations
 _LAST, _BEFORE = 2, 3  # change, and the one before
 _LEAST = 4  # change so far
-_STALLED = 5  # how often in a row it was none less
-_FRESH = 6  # whether begun without a guess
+_STALLED = 5  # consecutive iterations without a smaller change
+_FRESH = 6  # whether it was restarted without a guess
 
 
-# Of the change that one more iteration would make, in units of rounding.
+# Largest estimated change of another iteration, in units of rounding, to stop.
 _NEGLIGIBLE = 1e-3
-# The change at which an iteration that goes round in a circle does so by rounding.
+# Largest change at which stagnation is attributed to rounding.
 _ROUNDING = 16.0
 
 
 def _iterate(step: _Step, guess: Slopes, max_iterations: int):
     """Fixed-point iteration to rounding.
 
-    It ends where its changes stop to decrease, so that what is left is rounding, of
-    either sign. Any other tolerance leaves an error that has a direction in time.
+    It stops when its changes no longer decrease. The remaining error is rounding, of
+    either sign; that of a larger tolerance would break the symmetry.
     """
     dtype = step.h.dtype
     number = lambda x: jnp.asarray(x, dtype)
@@ -400,14 +400,14 @@ def _iterate(step: _Step, guess: Slopes, max_iterations: int):
         # decrease over two iterations.
         rate = jnp.maximum(change / last, last / before)
         stalled = jnp.where(change < least, 0, stalled + 1)
-        # What is at rest is all rounding, relative to itself.
+        # A component that is at rest changes by rounding alone.
         converged = (
             (change == 0)
             | (rate * change <= _NEGLIGIBLE)
             | ((stalled > 0) & (change <= _ROUNDING))
             | ((stalled >= 3) & (jnp.minimum(q, p) <= loose))
         )
-        # A guess may be outside of the domain where the state is not.
+        # A guess may be outside of the domain although the state is inside.
         finite = jnp.isfinite(change)
         restart = ~finite & (fresh == 0)
         failed = jnp.where(finite | restart, _GOING, _FAILED)
@@ -442,7 +442,7 @@ def _iterate(step: _Step, guess: Slopes, max_iterations: int):
 
 def _find_root(step: _Step, guess: Slopes, root_finder, max_iterations: int):
     nothing = jtu.tree_map(jnp.zeros_like, guess)
-    # Extrapolated, what is stiff may be far off.
+    # Extrapolation of stiff components may be inaccurate.
     sizes = (_largest(step.residual(x)) for x in (guess, nothing))
     better = jnp.less(*sizes)
     guess = jtu.tree_map(lambda x: jnp.where(better, x, 0), guess)
