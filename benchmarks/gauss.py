@@ -1,22 +1,20 @@
-"""Gauss collocation for energies that do not separate: speed against error.
+"""Gauss collocation for nonseparable energies: time of a solve against its error.
 
 Double pendulum and chain of three hinges with friction in each joint, and
-H = (q^2 + 1) (p^2 + 1) / 2. Each table holds the least time of a solve, in
-milliseconds, with an error at the final time of at most that in the column, relative to
-the largest entry of the solution; "-" where none of the runs is so accurate. Times are
-the least of several, compiled and warmed up, of all solvers alternately.
+H = (q^2 + 1) (p^2 + 1) / 2; with `PresymplecticCoupled` and Diffrax's `Dopri8`. A dash
+is an error that none of the runs reached. The last two rows are ratios of best times.
 """
 
-import argparse
-import time
-from typing import Any
+from functools import partial
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
+from _report import command_line, Table
+from _solve import final_state, reference, relative_error
+from _timing import error_curves, time_to
 
 import diffrax_presym as dps
 
@@ -65,81 +63,58 @@ FIXED = {
 TOLERANCES = 10.0 ** -np.arange(2, 14)
 
 
-@eqx.filter_jit
-def solve(system, solver, t1, dt0, y0, controller):
-    sol = dfx.diffeqsolve(
-        dps.HamiltonianTerm(system),
-        solver,
-        *(0.0, t1, dt0, y0),
-        stepsize_controller=controller,
-        max_steps=None,
-        throw=False,
-    )
-    return ravel_pytree(sol.ys)[0], sol.result == dfx.RESULTS.successful
+def curves(system, times, y0, exact, repeats, quick):
+    """The errors and times of every solver, by its name."""
+    span = times[1] - times[0]
+    solve = eqx.filter_jit(final_state)
 
+    def run(solver, sweep, adaptive=False):
+        return partial(solve, system, solver, times, y0, adaptive=adaptive), sweep
 
-def runs(t1, most) -> dict[str, list[Any]]:
-    """`{name: [(solver, dt0, controller), ...]}`, from long steps to short ones."""
-    found: dict[str, list[Any]] = {
-        name: [
-            (solver, t1 / n, dfx.ConstantStepSize())
-            for n in np.unique(np.geomspace(4 * t1 / 5, most / cost, 16).astype(int))
-        ]
+    most, points = (4e3, 4) if quick else (3e4, 16)
+    runs = {
+        name: run(
+            solver,
+            [
+                jnp.asarray(float(n))
+                for n in np.unique(
+                    np.geomspace(4 * span / 5, most / cost, points).astype(int)
+                )
+            ],
+        )
         for name, (solver, cost) in FIXED.items()
     }
-    dopri = dfx.Dopri8(scan_kind="lax")
-    found["Dopri8"] = [
-        (dopri, 0.01, dfx.PIDController(rtol=tol, atol=tol)) for tol in TOLERANCES
-    ]
-    return found
+    tolerances = [jnp.asarray(tol) for tol in TOLERANCES[:: 3 if quick else 1]]
+    runs["Dopri8"] = run(dfx.Dopri8(scan_kind="lax"), tolerances, True)
+    return error_curves(runs, lambda y: relative_error(y, exact), repeats)
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--most", type=float, default=3e4, help="evaluations of a run")
-    options = parser.parse_args()
+    options = command_line(__doc__).parse_args()
     for problem, (system, y0, t1) in PROBLEMS.items():
-        controller = dfx.PIDController(rtol=1e-14, atol=1e-14)
-        exact = np.asarray(solve(system, dfx.Dopri8(), t1, 0.01, y0, controller)[0])
-        check = dps.PresymplecticGauss(8)
-        finest = jnp.asarray(t1 / 1000)
-        other, _ = solve(system, check, t1, finest, y0, dfx.ConstantStepSize())
-        size = np.max(np.abs(exact))
-        print(f"\n{problem}; references differ by {np.max(np.abs(other - exact)):.0e}")
-        errors, times = {}, {}
-        sweeps = runs(t1, options.most)
-        for name, sweep in sweeps.items():
-            for i, (solver, dt0, controller) in enumerate(sweep):
-                args = system, solver, t1, jnp.asarray(dt0), y0, controller
-                y, solved = jax.block_until_ready(solve(*args))
-                if solved:
-                    errors[name, i] = np.max(np.abs(np.asarray(y) - other)) / size
-                    times[name, i] = np.inf
-                sweep[i] = args
-        for _ in range(options.repeats):
-            for name, i in errors:
-                start = time.perf_counter()
-                jax.block_until_ready(solve(*sweeps[name][i]))
-                spent = time.perf_counter() - start
-                times[name, i] = min(times[name, i], spent)
-        print(f"{'milliseconds to':16}" + "".join(f"{x:>10.0e}" for x in TARGETS))
-        best = {}
-        for name in sweeps:
-            row = f"  {name:14}"
-            for x in TARGETS:
-                least = [times[k] for k in errors if k[0] == name and errors[k] <= x]
-                best[name, x] = min(least, default=np.inf)
-                row += f"{1e3 * best[name, x]:>10.2f}" if least else f"{'-':>10}"
-            print(row)
-        gauss = [min(best[n, x] for n in sweeps if "Gauss" in n) for x in TARGETS]
-        for other_name in ("Coupled", "Dopri8"):
-            others = [
-                min(best[n, x] for n in sweeps if other_name in n) for x in TARGETS
-            ]
-            ratios = (f"{b / a:>10.1f}" for a, b in zip(gauss, others, strict=True))
-            print(f"  {other_name + '/Gauss':14}" + "".join(ratios))
-        jax.clear_caches()
+        times = jnp.array([0.0, t1])
+        exact = jax.tree.map(lambda y: y[-1], reference(system, y0, times))
+        repeats = 2 if options.quick else 7
+        found = curves(system, times, y0, exact, repeats, options.quick)
+        titles = (f"{target:.0e}:>9.2f" for target in TARGETS)
+        table = Table(f"{problem}: milliseconds to an error", "solver:<14", *titles)
+        for name, curve in found.items():
+            table.row(name, *(_milliseconds(curve, target) for target in TARGETS))
+        for other in ("Coupled", "Dopri8"):
+            ratios = []
+            for target in TARGETS:
+                gauss, theirs = (
+                    min(time_to(c, target) for n, c in found.items() if kind in n)
+                    for kind in ("Gauss", other)
+                )
+                ratio = theirs / gauss
+                ratios.append(ratio if np.isfinite(ratio) else None)
+            table.row(f"{other} / Gauss", *ratios)
+
+
+def _milliseconds(curve, target):
+    seconds = time_to(curve, target)
+    return 1e3 * seconds if np.isfinite(seconds) else None
 
 
 if __name__ == "__main__":

@@ -131,6 +131,7 @@ def test_one_stage_is_the_midpoint_rule():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stages", [4])
 def test_newton_finds_the_same(stages):
     newton = dps.PresymplecticGauss(stages, FINDER)
@@ -173,6 +174,7 @@ def spin(t, q, p, args):
     return (1 + jnp.sum(q**2)) * jnp.sum(p**2) / 2 + jnp.sum(q**2) ** 2
 
 
+@pytest.mark.slow
 def test_quadratic_invariants_are_kept():
     solver = dps.PresymplecticGauss(3)
     saveat = dfx.SaveAt(steps=True)
@@ -192,6 +194,7 @@ def test_rounding_does_not_drift():
     assert np.max(np.abs(errors)) < 2e-15
 
 
+@pytest.mark.slow
 def test_long_steps_keep_the_energy():
     y0 = (jnp.array([0.6, 0.9]), jnp.zeros(2))
     energy = lambda t, y, args: CHAIN.energy(t, *y)
@@ -240,6 +243,7 @@ def test_dense_output_of_one_stage_is_hermite():
 # As any solver of Diffrax
 
 
+@pytest.mark.slow
 def test_backwards_in_time():
     solver = dps.PresymplecticGauss(4)
     end = solve(FORCED, solver, 0.0, 1.0, 0.1, Y0).ys
@@ -252,6 +256,7 @@ def test_backwards_in_time():
     assert_close(jax.tree.map(lambda x: x[::-1], back.ys), there.ys, 1e-7)
 
 
+@pytest.mark.slow
 def test_steps_of_any_length_and_vmap():
     # Each a first guess for the next, and far from it.
     ts = jnp.array([0.0, 0.3, 0.31, 0.5, 0.50001, 1.0])
@@ -282,6 +287,7 @@ def test_half_solver_adapts_steps():
     assert sol.stats["num_rejected_steps"] < sol.stats["num_accepted_steps"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_precision_of_the_state_is_kept(dtype):
     y0 = jax.tree.map(lambda x: {"x": x.astype(dtype)}, Y0)
@@ -319,6 +325,7 @@ def rooted_energy(t, q, p, args):
     return (1 + jnp.sum(q**2)) * jnp.sum(p**2) / 2 - jnp.sum(jnp.sqrt(q - 1e-3))
 
 
+@pytest.mark.slow
 def test_a_guess_outside_of_the_domain_is_dropped():
     # It falls towards the edge, and turns.
     y0 = (jnp.array([0.05]), jnp.array([-0.01]))
@@ -355,6 +362,7 @@ def stiff_energy(t, q, p, args):
     return (1 + jnp.sum(q**2)) * jnp.sum(p**2) / 2 + 1e4 * jnp.sum(q**2)
 
 
+@pytest.mark.slow
 def test_newton_solves_what_is_stiff():
     y0 = (jnp.array([0.001, -0.002]), jnp.array([0.2, 0.4]))
     H = dps.Hamiltonian(stiff_energy)
@@ -367,6 +375,7 @@ def test_newton_solves_what_is_stiff():
     assert abs(H.energy(ZERO, q, p) / H.energy(ZERO, *y0) - 1) < 0.1
 
 
+@pytest.mark.slow
 def test_a_system_at_rest_stays_there():
     damped = dps.LagrangianSystem(chain_mass, chain_potential, friction=5.0)
     sol = solve(damped, dps.PresymplecticGauss(6), 0.0, 80.0, 0.02, PENDULUM)
@@ -628,7 +637,7 @@ def test_a_bad_mass_matrix_is_a_result(name):
         (
             lambda: dps.LagrangianSystem(chain_mass, lambda t, q, args: q),
             PENDULUM,
-            "one real number",
+            "a real scalar",
         ),
     ],
 )
@@ -642,6 +651,7 @@ def test_there_is_no_exact_drift():
         CHAIN.kinetic_flow(ZERO, jnp.array(0.1), *PENDULUM)
 
 
+@pytest.mark.slow
 def test_any_solver_takes_the_term():
     exact = solve(CHAIN, dps.PresymplecticGauss(8), 0.0, 1.0, 0.05, PENDULUM).ys
     coupled = solve(CHAIN, dps.PresymplecticCoupled(4), 0.0, 1.0, 0.01, PENDULUM).ys

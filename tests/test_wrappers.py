@@ -69,7 +69,7 @@ def test_wrappers_of_schemes_for_any_energy(scheme: Scheme):
     assert_close(one_step(wrapped, NONSEPARABLE), expected, tolerance)
 
 
-@wrappers
+@pytest.mark.parametrize("wrap", [WRAPPERS["both"]], ids=["both"])
 @pytest.mark.parametrize(
     "compose",
     [dps.Suzuki4, lambda base: dps.Substeps(base, 3)],
@@ -175,9 +175,9 @@ def test_gradients_by_reversal_through_wrappers(solver):
     [
         dps.PresymplecticLeapfrog(),
         dps.Substeps(dps.Strang(), 2),
-        dps.PresymplecticTao(5.0),
-        dps.PresymplecticCoupled(2),
-        dps.PresymplecticMidpoint(_finder),
+        pytest.param(dps.PresymplecticTao(5.0), marks=pytest.mark.slow),
+        pytest.param(dps.PresymplecticCoupled(2), marks=pytest.mark.slow),
+        pytest.param(dps.PresymplecticMidpoint(_finder), marks=pytest.mark.slow),
     ],
     ids=lambda solver: type(solver).__name__,
 )
