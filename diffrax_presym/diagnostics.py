@@ -10,7 +10,6 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Inexact, PyTree
 
 from ._misc import as_time, tree_dot
-from ._solver import AbstractPresymplecticSolver
 from ._split import State
 from ._term import HamiltonianTerm
 
@@ -203,7 +202,7 @@ def copy_distance(solver, y: State, solver_state) -> Inexact[Array, ""]:
 
     `ValueError` if the solver keeps no copies.
     """
-    if not isinstance(solver, AbstractPresymplecticSolver):
+    if not hasattr(solver, "distance"):
         raise ValueError(
             f"`{type(solver).__name__}` is not a solver of this package, and keeps no "
             "copies of the system. Use `PresymplecticCoupled()`, for example."
