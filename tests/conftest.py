@@ -4,16 +4,16 @@ import jax
 import pytest
 
 
-# Doubles, because the promises are made to rounding; strict, because a silent promotion
-# is how a `float32` solve turns into a slow one.
+# Double precision, as properties are tested to rounding; strict promotion, as a silent
+# promotion would make a `float32` solve slow.
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 pytest.register_assert_rewrite("helpers")
 
-# The slowest of several similar tests, by `pytest --durations`. They are marked as slow,
-# as are tests with the marker in their own file.
+# The slowest of several similar tests, by `pytest --durations`. They are marked slow,
+# as are those with the marker in their own file.
 SLOW = re.compile(
     "|".join(
         [
