@@ -16,7 +16,7 @@ from helpers import assert_close, each, IMPLICIT, mixed_energy, Scheme, SCHEMES
 from jax.flatten_util import ravel_pytree
 
 import diffrax_presym as dps
-from diffrax_presym._adjoint._backward import clock
+from diffrax_presym._adjoint._clock import clock
 
 
 REVERSIBLE = dps.ReversibleAdjoint()

@@ -1,12 +1,8 @@
 """The backward pass through the steps of a solve."""
 
-from collections.abc import Callable
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
-import diffrax as dfx
 import equinox as eqx
-import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -14,28 +10,10 @@ from jaxtyping import Array, PyTree
 
 from .._misc import tree_sum
 from .._solver._engine import Span, undo, vjp, vjp_step
-from .._system import System
+from ._clock import clock
+from ._interpolated import pull_interpolated
 from ._saves import is_within, materialise, Saved, SavedOutputs
-
-
-class Inputs(NamedTuple):
-    """The inputs of a solve."""
-
-    start: tuple[PyTree, PyTree]  # the state and the solver state
-    parameters: tuple[System, list[Callable]]  # the system, and functions of `SaveAt`
-    rest: dict[str, Any]  # inputs that are not differentiated
-    run: Callable  # the loop
-
-
-class Position(NamedTuple):
-    """The state of the backward pass."""
-
-    n: Array  # the number of steps left
-    t: Array
-    state: tuple[PyTree, PyTree]
-    bar: tuple[PyTree, PyTree]  # the cotangents of the state
-    gradient: PyTree  # the cotangents of the parameters so far
-    left: list[Saved]
+from ._types import Inputs, Position
 
 
 class Backward:
@@ -95,7 +73,8 @@ class Backward:
         start_bar = jtu.tree_map(jnp.zeros_like, at.bar)
         if self._may_interpolate():
             # Most steps have no output between their ends, and are cheaper.
-            inner = lambda at: self._pull_interpolated(
+            inner = lambda at: pull_interpolated(
+                self,
                 at,
                 n,
                 span,
@@ -138,67 +117,9 @@ class Backward:
         left = [*at.left[:i], Saved(times, outputs), *at.left[i + 1 :]]
         return at._replace(left=left)
 
-    def _pull_interpolated(self, at: Position, n: Array, span: Span, start: PyTree):
-        """Pull back the outputs between the ends of a step, to its end (in the
-        position) and to its start."""
-        t_start = self.time(n)
-
-        def dense_info(moved, start, end):
-            system, _ = eqx.combine(moved, self.fixed)
-            return self.solver.dense_info(system, *span, start, end)
-
-        info, pull = jax.vjp(dense_info, self.moved, start, at.state)
-        info_bar = jtu.tree_map(jnp.zeros_like, info)
-        if self.dense is not None:
-            info_bar = jtu.tree_map(lambda x: x[n], self.dense)
-
-        def take(i, x):
-            (times, outputs), (gradient, info_bar) = x
-            times, outputs = times - 1, outputs - 1
-            t = self.saves.subs[i].ts[times]
-            evaluate = lambda info: self.solver.interpolation_cls(
-                t0=t_start, t1=at.t, **info
-            ).evaluate(t)
-            y, pull = jax.vjp(evaluate, info)
-            bar = self.saves.bar_at(i, outputs, True)
-            more, y_bar = self.saves.pull_saved_output(i, t, y, bar)
-            sums = tree_sum((gradient, info_bar), (more, *pull(y_bar)))
-            return Saved(times, outputs), sums
-
-        sums, left = (at.gradient, info_bar), list(at.left)
-        for i, sub in enumerate(self.saves.subs):
-            if sub.ts is not None:
-                inside = lambda x, ts=sub.ts: is_within(ts, x[0].times, n, t_start)
-                left[i], sums = lax.while_loop(
-                    inside, partial(take, i), (left[i], sums)
-                )
-        gradient, info_bar = sums
-        more, start_bar, end_bar = pull(info_bar)
-        gradient, bar = tree_sum((gradient, at.bar), (more, end_bar))
-        return at._replace(gradient=gradient, bar=bar, left=left), start_bar
-
 
 def _add(at: Position, bars) -> Position:
     gradient, y_bar = bars
     y, carry = at.bar
     gradient = tree_sum(at.gradient, gradient)
     return at._replace(gradient=gradient, bar=(tree_sum(y, y_bar), carry))
-
-
-def clock(controller, t0: Array, t1: Array, dt0: Array) -> Callable[[Array], Array]:
-    """The start of step `n`, as computed by the step size controllers of Diffrax."""
-    if isinstance(controller, dfx.StepTo):
-        return lambda n: controller.ts[n]
-    up, down = (jnp.asarray(sign * jnp.inf, t0.dtype) for sign in (1, -1))
-    steps = jnp.ceil((t1 - t0) / jnp.nextafter(dt0, up))
-    almost = t1
-    for _ in range(100):
-        almost = jnp.nextafter(almost, down)
-
-    def time(n):
-        t = t0 + (t1 - t0) * (n.astype(t0.dtype) / steps)
-        t = jnp.where((n >= steps) | (t > almost), t1, t)
-        # Only the first step has the length `dt0`.
-        return jnp.where(n == 1, jnp.minimum(t0 + dt0, t1), t)
-
-    return time

@@ -7,7 +7,8 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
 from .._misc import tree_sub
-from ._backward import Backward, Position
+from ._backward import Backward
+from ._types import Position
 
 
 def gradient(

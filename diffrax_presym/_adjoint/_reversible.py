@@ -10,16 +10,22 @@ from functools import partial
 import diffrax as dfx
 import equinox as eqx
 import equinox.internal as eqxi
-import jax
 import jax.lax as lax
-import jax.tree_util as jtu
-from jax.core import Tracer
 
 from .._closures import closure_to_pytree
 from .._misc import as_positive
 from .._term import as_system
-from ._backward import Backward, Inputs
-from ._checkpoints import gradient
+from ._rule import (
+    forward,
+    get_fns,
+    get_hamiltonian,
+    get_start,
+    holds_tracers,
+    is_none,
+    refuse,
+    solve,
+)
+from ._types import Inputs
 
 
 class ReversibleAdjoint(dfx.AbstractAdjoint):
@@ -72,30 +78,30 @@ class ReversibleAdjoint(dfx.AbstractAdjoint):
         system = as_system(terms, args)
         _check(solver, rest["stepsize_controller"], rest["event"])
         if passed_controller_state:
-            raise ValueError(_refuse("a `controller_state`"))
+            raise ValueError(refuse("a `controller_state`"))
         y, carry = init_state.y, init_state.solver_state
         if init_state.made_jump is not False:
             # The solver state is stale, and is recomputed before the first step.
             restart = lambda: solver.start(system, system.time(rest["t0"]), y)
             carry = lax.cond(init_state.made_jump, restart, lambda: carry)
-        fns = _fns(saveat)
+        fns = get_fns(saveat)
         rest |= dict(
             solver=solver,
-            terms=eqx.tree_at(_hamiltonian, terms, None),
-            saveat=eqx.tree_at(_fns, saveat, [None] * len(fns)),
+            terms=eqx.tree_at(get_hamiltonian, terms, None),
+            saveat=eqx.tree_at(get_fns, saveat, [None] * len(fns)),
             init_state=eqx.tree_at(
-                _start, init_state, (None, None, False), is_leaf=_is_none
+                get_start, init_state, (None, None, False), is_leaf=is_none
             ),
         )
         # Closures of functions are differentiated too.
         parameters = closure_to_pytree((system, fns))
-        inputs = Inputs((y, carry), parameters, rest, _forward)
-        if _holds_tracers(parameters, system.time(rest["t0"]), y):
+        inputs = Inputs((y, carry), parameters, rest, forward)
+        if holds_tracers(parameters, system.time(rest["t0"]), y):
             # Convert them to inputs, which shows whether they are differentiated.
             # Equinox does not convert a function without a closure.
-            run = eqx.filter_closure_convert(partial(_forward), inputs)
+            run = eqx.filter_closure_convert(partial(forward), inputs)
             inputs = inputs._replace(run=run)
-        out = _solve(inputs, self)
+        out = solve(inputs, self)
         # To JAX all outputs of a custom rule have derivatives, even integers.
         out, counts = eqx.partition(out, eqx.is_inexact_array)
         return eqx.combine(out, eqxi.nondifferentiable_backward(counts))
@@ -118,104 +124,17 @@ exceeds `tol`.
 """
 
 
-# Not covered by `closure_to_pytree`.
-_HIDDEN = (
-    "`ReversibleAdjoint` cannot differentiate with respect to an array that a function "
-    "of the Hamiltonian, or of `SaveAt(fn=...)`, holds in a static field, a global "
-    "variable or an object without `__dict__`. Pass the array through `args`, make it "
-    "a field of an `equinox.Module` that is not static, or use "
-    "`diffrax.RecursiveCheckpointAdjoint()` instead."
-)
-
-
-def _refuse(what: str) -> str:
-    return (
-        f"`ReversibleAdjoint` does not support {what}. Use "
-        "`diffrax.RecursiveCheckpointAdjoint()` instead."
-    )
-
-
 def _check(solver, controller, event) -> None:
     # Diffrax's wrappers of solvers have no `reverse`.
     if getattr(solver, "reverse", None) is None:
         what = f"`{type(solver).__name__}`, which has no known adjoint method"
-        raise ValueError(_refuse(what))
+        raise ValueError(refuse(what))
     if type(controller) not in (dfx.ConstantStepSize, dfx.StepTo):
         raise ValueError(
-            _refuse(
+            refuse(
                 f"`{type(controller).__name__}`: only `diffrax.ConstantStepSize()` and "
                 "`diffrax.StepTo(ts)` make steps that do not depend on the state"
             )
         )
     if event is not None:
-        raise ValueError(_refuse("events"))
-
-
-# Where these are in the inputs from Diffrax.
-_is_none = lambda x: x is None
-_is_sub = lambda x: isinstance(x, dfx.SubSaveAt)
-_fns = lambda saveat: [sub.fn for sub in jtu.tree_leaves(saveat.subs, is_leaf=_is_sub)]
-_hamiltonian = lambda terms: terms.term.hamiltonian
-_start = lambda state: (state.y, state.solver_state, state.made_jump)
-
-
-def _holds_tracers(parameters, t, y) -> bool:
-    """Whether a function uses arrays of an outer transformation that are no leaves."""
-    arrays, static = eqx.partition((parameters, t, y), eqx.is_array)
-
-    def use_all(arrays):
-        (system, fns), t, y = eqx.combine(arrays, static)
-        used = system.slope(t, y), [fn(t, y, system.args) for fn in fns]
-        return eqx.filter(used, eqx.is_array)
-
-    return any(isinstance(x, Tracer) for x in jax.make_jaxpr(use_all)(arrays).consts)
-
-
-def _forward(inputs: Inputs):
-    """Diffrax's own loop, as for a solve without gradients."""
-    system, fns = inputs.parameters
-    init_state, saveat = inputs.rest["init_state"], inputs.rest["saveat"]
-    start = (*inputs.start, False)
-    changed = dict(
-        terms=eqx.tree_at(
-            _hamiltonian, inputs.rest["terms"], system.hamiltonian, is_leaf=_is_none
-        ),
-        saveat=eqx.tree_at(_fns, saveat, fns, is_leaf=_is_none),
-        init_state=eqx.tree_at(_start, init_state, start, is_leaf=_is_none),
-    )
-    return dfx.ForwardMode().loop(
-        **(inputs.rest | changed),
-        args=system.args,
-        throw=None,
-        passed_solver_state=None,
-        passed_controller_state=None,
-    )
-
-
-@eqx.filter_custom_vjp
-def _solve(inputs: Inputs, adjoint: ReversibleAdjoint):
-    return inputs.run(inputs._replace(run=_forward))
-
-
-@_solve.def_fwd
-def _solve_fwd(perturbed: Inputs, inputs: Inputs, adjoint: ReversibleAdjoint):
-    if any(jtu.tree_leaves(perturbed.rest)):
-        raise ValueError(
-            _refuse(
-                "derivatives with respect to times (`t0`, `t1`, `dt0`, `ts`) or to the "
-                "solver"
-            )
-        )
-    if any(jtu.tree_leaves(perturbed.run)):
-        raise ValueError(_HIDDEN)
-    # Not `_solve`, so that this supports forward mode.
-    out = inputs.run(inputs._replace(run=_forward))
-    return out, out[0]
-
-
-@_solve.def_bwd
-def _solve_bwd(final, cotangents, perturbed: Inputs, inputs: Inputs, adjoint):
-    backward = Backward(inputs, perturbed, final, cotangents[0])
-    bar, more = gradient(backward, adjoint.checkpoints, adjoint.tol)
-    none = jtu.tree_map(lambda _: None, (inputs.rest, inputs.run))
-    return Inputs(bar, more, *none)
+        raise ValueError(refuse("events"))
