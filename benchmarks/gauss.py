@@ -107,8 +107,8 @@ def main():
                     min(time_to(c, target) for n, c in found.items() if kind in n)
                     for kind in ("Gauss", other)
                 )
-                ratio = theirs / gauss
-                ratios.append(ratio if np.isfinite(ratio) else None)
+                reached = np.isfinite(gauss) and np.isfinite(theirs)
+                ratios.append(theirs / gauss if reached else None)
             table.row(f"{other} / Gauss", *ratios)
 
 
