@@ -1,12 +1,33 @@
+import abc
+
 import diffrax as dfx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from ._misc import cast_to
 
 
-class HermiteInterpolation(dfx.AbstractLocalInterpolation):
+class AbstractStepInterpolation(dfx.AbstractLocalInterpolation):
+    """The interpolation of a step, as a function of the fraction of the step."""
+
+    @abc.abstractmethod
+    def at_fraction(self, s: Array) -> PyTree:
+        """The value at a fraction from 0 to 1."""
+
+    def evaluate(self, t0, t1=None, left: bool = True) -> PyTree:
+        del left
+        if t1 is not None:
+            start, end = self.evaluate(t0), self.evaluate(t1)
+            return jtu.tree_map(lambda a, b: b - a, start, end)
+        # A step of zero length, as in an empty solve, evaluates to its start.
+        length = self.t1 - self.t0
+        empty = length == 0
+        s = jnp.where(empty, 0, (t0 - self.t0) / jnp.where(empty, 1, length))
+        return self.at_fraction(s)
+
+
+class HermiteInterpolation(AbstractStepInterpolation):
     """Hermite interpolation of a step from values and derivatives at its two ends.
 
     Exact at both ends. Cubic from first derivatives, with an error of fourth order in
@@ -23,17 +44,9 @@ class HermiteInterpolation(dfx.AbstractLocalInterpolation):
     b0: PyTree = None
     b1: PyTree = None
 
-    def evaluate(self, t0, t1=None, left: bool = True) -> PyTree:
-        del left
-        if t1 is not None:
-            start, end = self.evaluate(t0), self.evaluate(t1)
-            return jtu.tree_map(lambda a, b: b - a, start, end)
-        # A step of zero length, as in an empty solve, evaluates to its start.
-        length = self.t1 - self.t0
-        empty = length == 0
-        s = jnp.where(empty, 0, (t0 - self.t0) / jnp.where(empty, 1, length))
-        bends = () if self.b0 is None else (self.b0, self.b1)
-        ends = (self.y0, self.y1, self.k0, self.k1, *bends)
+    def at_fraction(self, s: Array) -> PyTree:
+        seconds = () if self.b0 is None else (self.b0, self.b1)
+        ends = (self.y0, self.y1, self.k0, self.k1, *seconds)
         return jtu.tree_map(lambda *x: _hermite(cast_to(s, x[0]), *x), *ends)
 
 

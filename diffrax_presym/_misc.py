@@ -65,12 +65,17 @@ class Sum(eqx.Module):
 
 
 _T = TypeVar("_T")
-_is_sum = lambda x: isinstance(x, Sum)
+is_sum = lambda x: isinstance(x, Sum)
 
 
 def values(x: _T) -> _T:
     """The arrays of a state, without the errors kept by compensated summation."""
-    return jtu.tree_map(lambda x: x.value if _is_sum(x) else x, x, is_leaf=_is_sum)
+    return jtu.tree_map(lambda x: x.value if is_sum(x) else x, x, is_leaf=is_sum)
+
+
+def rounding_errors(x: PyTree) -> PyTree:
+    """The rounding errors of a state whose leaves are `Sum`s."""
+    return jtu.tree_map(lambda x: x.lost, x, is_leaf=is_sum)
 
 
 def tree_add(y: PyTree, h: ArrayLike, dy: PyTree) -> PyTree:
@@ -86,7 +91,7 @@ def tree_sum(x: PyTree, y: PyTree) -> PyTree:
 
 def tree_sub(x: PyTree, y: PyTree) -> PyTree:
     """`x - y`, where both may have `Sum`s for leaves."""
-    return jtu.tree_map(lambda xi, yi: xi - yi, x, y, is_leaf=_is_sum)
+    return jtu.tree_map(lambda xi, yi: xi - yi, x, y, is_leaf=is_sum)
 
 
 def tree_scale(c: ArrayLike | None, y: PyTree) -> PyTree:
@@ -101,6 +106,13 @@ def tree_dot(x: PyTree, y: PyTree) -> Array:
     dots = jtu.tree_map(lambda xi, yi: jnp.sum(xi * yi), x, y)
     with jax.numpy_dtype_promotion("standard"):
         return jtu.tree_reduce(jnp.add, dots)
+
+
+def largest(x: PyTree) -> Array:
+    """The largest absolute value of all entries."""
+    sizes = jtu.tree_map(lambda x: jnp.max(jnp.abs(x), initial=0), x)
+    with jax.numpy_dtype_promotion("standard"):
+        return jtu.tree_reduce(jnp.maximum, sizes)
 
 
 def all_finite(x: PyTree) -> Bool[Array, ""]:

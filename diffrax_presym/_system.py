@@ -51,6 +51,10 @@ class System(eqx.Module):
         """The arrays of a state, or part of one."""
         return values(x)
 
+    def zeros(self, x: PyTree) -> PyTree:
+        """Arrays of zeros like a state, or part of one."""
+        return jtu.tree_map(jnp.zeros_like, values(x))
+
     # The vector field.
 
     @property

@@ -226,6 +226,24 @@ def test_steps_of_nominal_length_inside_others(wrap):
     np.testing.assert_allclose(end, [np.cos(steps * h), -np.sin(steps * h)], atol=2e-4)
 
 
+def test_compositions_refuse_what_is_not_symmetric_of_a_symmetric_base():
+    lopsided = dps.Composition(dps.PresymplecticLeapfrog(), [0.3, 0.7])
+    assert lopsided.reverse is not None
+    for inside in (lopsided, dps.Checked(lopsided), lopsided.reverse):
+        with pytest.raises(ValueError, match="need a symmetric base"):
+            dps.Suzuki4(inside)
+
+
+def test_the_adjoint_method_has_the_nominal_length():
+    solver = dps.Compensated(dps.PresymplecticEuler(), length=0.0625)
+    t0 = jnp.array(1.5e4, jnp.float32)
+    t1 = t0 + jnp.float32(0.0634)
+    assert t1 - t0 != 0.0625
+    assert solver.step_length(t0, t1) == 0.0625
+    assert solver.reverse is not None
+    assert solver.reverse.step_length(t0, t1) == 0.0625
+
+
 def test_the_distance_of_copies_through_wrappers():
     saveat = dfx.SaveAt(t1=True, solver_state=True)
     for base in (dps.PresymplecticCoupled(2), dps.PresymplecticTao(5.0)):

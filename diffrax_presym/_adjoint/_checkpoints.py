@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
-from .._misc import tree_sub
+from .._misc import largest, tree_sub
 from ._backward import Backward
 from ._types import Position
 
@@ -103,13 +103,13 @@ class _Checkpoints:
         # Positions and momenta are compared in units of their largest values. The
         # solver state may be pure rounding, and is not compared.
         units = jtu.tree_map(
-            lambda x, y: jnp.maximum(_largest(x), _largest(y)),
+            lambda x, y: jnp.maximum(largest(x), largest(y)),
             *(states[0], at.state[0]),
         )
 
         def size(state):
             scaled = jtu.tree_map(
-                lambda x, u: (_largest(x) / jnp.where(u > 0, u, 1)).astype(float),
+                lambda x, u: (largest(x) / jnp.where(u > 0, u, 1)).astype(float),
                 *(state[0], units),
             )
             return jtu.tree_reduce(jnp.maximum, scaled)
@@ -125,7 +125,3 @@ class _Checkpoints:
 
         zero = jnp.zeros_like(size(self.known))
         return lax.fori_loop(0, parts, part, (at, zero))
-
-
-def _largest(x: Array) -> Array:
-    return jnp.max(jnp.abs(x), initial=0)

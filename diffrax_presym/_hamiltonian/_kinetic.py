@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import lineax as lx
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
@@ -16,6 +15,7 @@ from .._friction._functions import gauss_legendre, quadrature
 from .._misc import (
     as_positive,
     cast_to,
+    largest,
     scalar_fn,
     tree_add,
     tree_dot,
@@ -141,9 +141,7 @@ class RelativisticKinetic(AbstractKinetic):
     def _scaled(self, p):
         """The momentum and `m c` in units of the largest of them, their squares, and
         the unit. Without units the squares would overflow."""
-        sizes = jtu.tree_map(lambda x: jnp.max(jnp.abs(x), initial=0), p)
-        with jax.numpy_dtype_promotion("standard"):
-            unit = jtu.tree_reduce(jnp.maximum, sizes)
+        unit = largest(p)
         rest = cast_to(self.mass, unit) * cast_to(self.speed, unit)
         if rest.shape != ():
             raise ValueError(

@@ -1,11 +1,11 @@
 import abc
 from functools import partial
-from typing import ClassVar, Generic, TypeVar
+from typing import ClassVar, Generic, TYPE_CHECKING, TypeVar
 
 import diffrax as dfx
 import jax.lax as lax
 import jax.tree_util as jtu
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from .._interpolation import HermiteInterpolation
 from .._misc import tree_scale
@@ -22,6 +22,13 @@ from ._engine import (
     Span,
     Stage,
 )
+
+
+if TYPE_CHECKING:
+    # To a type checker an abstract field is any kind of field.
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 _Carry = TypeVar("_Carry")
@@ -165,7 +172,46 @@ class AbstractMoveSolver(AbstractPresymplecticSolver[_Carry], Generic[_Carry]):
         return self if self.is_symmetric else AdjointMethod(self)
 
 
-class AdjointMethod(AbstractMoveSolver[_Carry], Generic[_Carry]):
+class AbstractWrapper(AbstractMoveSolver[_Carry], Generic[_Carry]):
+    """A scheme that wraps another one and shares its properties."""
+
+    base: AbstractVar[AbstractPresymplecticSolver]
+
+    def __check_init__(self):
+        if not isinstance(self.base, AbstractPresymplecticSolver):
+            raise ValueError(
+                "`base` must be a presymplectic solver, for example "
+                f"`PresymplecticLeapfrog()`, but got {self.base!r}."
+            )
+
+    @property
+    def is_symmetric(self) -> bool:
+        return self.base.is_symmetric
+
+    @property
+    def reverse(self) -> AbstractPresymplecticSolver[_Carry] | None:
+        return None if self.base.reverse is None else super().reverse
+
+    def order(self, terms) -> int:
+        return self.base.order(terms)
+
+    def start(self, system: System, t: Array, y: State) -> PyTree:
+        return self.base.start(system, t, y)
+
+    def slope(self, system: System, t: Array, y: State, carry: PyTree) -> State:
+        return self.base.slope(system, t, y, carry)
+
+    def step_length(self, t0: Array, t1: Array) -> Array:
+        return self.base.step_length(t0, t1)
+
+    def composition_error(self) -> str | None:
+        return self.base.composition_error() or super().composition_error()
+
+    def distance(self, y: State, solver_state: PyTree) -> Array:
+        return self.base.distance(y, solver_state)
+
+
+class AdjointMethod(AbstractWrapper[_Carry], Generic[_Carry]):
     """The adjoint method of a list of moves: their inverses in reverse order."""
 
     base: AbstractPresymplecticSolver[_Carry]
@@ -177,15 +223,6 @@ class AdjointMethod(AbstractMoveSolver[_Carry], Generic[_Carry]):
     @property
     def reverse(self) -> AbstractPresymplecticSolver[_Carry]:
         return self.base
-
-    def order(self, terms) -> int:
-        return self.base.order(terms)
-
-    def start(self, system: System, t: Array, y: State) -> _Carry:
-        return self.base.start(system, t, y)
-
-    def slope(self, system: System, t: Array, y: State, carry: _Carry) -> State:
-        return self.base.slope(system, t, y, carry)
 
     def moves(self, system: System) -> Moves:
         return self.base.moves(system).inverse

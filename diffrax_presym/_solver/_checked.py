@@ -1,10 +1,9 @@
 from jaxtyping import PyTree
 
 from .._system import System
-from ._base import AbstractPresymplecticSolver
+from ._base import AbstractPresymplecticSolver, AbstractWrapper
 from ._engine import Moves, Stages
 from ._moves import check_finite
-from ._wrapper import AbstractWrapper
 
 
 class Checked(AbstractWrapper[PyTree]):

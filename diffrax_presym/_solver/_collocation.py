@@ -5,12 +5,11 @@ from collections.abc import Callable
 from decimal import Decimal, localcontext
 from typing import Any, NamedTuple
 
-import diffrax as dfx
-import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
+from .._interpolation import AbstractStepInterpolation
 from .._misc import cast_to
 
 
@@ -135,7 +134,7 @@ def _round(x: Any) -> np.ndarray:
     return np.vectorize(float, otypes=[float])(np.array(x, dtype=object))
 
 
-class CollocationInterpolation(dfx.AbstractLocalInterpolation):
+class CollocationInterpolation(AbstractStepInterpolation):
     """The polynomial of a step whose slopes are those of its stages and its two ends.
 
     Exact at both ends. With s stages, its error between the ends is of order s + 2 in
@@ -149,16 +148,7 @@ class CollocationInterpolation(dfx.AbstractLocalInterpolation):
     # Legendre coefficients of the slope, times the length of the step, from P_1 on.
     slopes: PyTree
 
-    def evaluate(self, t0, t1=None, left: bool = True) -> PyTree:
-        del left
-        if t1 is not None:
-            start, end = self.evaluate(t0), self.evaluate(t1)
-            return jtu.tree_map(lambda a, b: b - a, start, end)
-        # A step of no length, as in an empty solve, is all start.
-        length = self.t1 - self.t0
-        empty = length == 0
-        s = jnp.where(empty, 0, (t0 - self.t0) / jnp.where(empty, 1, length))
-
+    def at_fraction(self, s: Array) -> PyTree:
         def leaf(y0, y1, slopes):
             x = cast_to(s, y0)
             p = legendre(len(slopes) + 2, 2 * x - 1)

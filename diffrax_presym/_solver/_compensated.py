@@ -5,10 +5,9 @@ from jaxtyping import Array, Inexact, PyTree
 from .._misc import as_positive, cast_to, Sum
 from .._split import State
 from .._system import System
-from ._base import AbstractPresymplecticSolver
+from ._base import AbstractPresymplecticSolver, AbstractWrapper
 from ._engine import Moves, Stages
 from ._moves import to_sums
-from ._wrapper import AbstractWrapper
 
 
 class Compensated(AbstractWrapper[PyTree]):

@@ -8,7 +8,7 @@ import optimistix as optx
 from jaxtyping import PyTree
 
 from .._system import System
-from ._base import AbstractPresymplecticSolver
+from ._base import AbstractPresymplecticSolver, AbstractWrapper
 from ._engine import Moves, Stages
 from ._leapfrog import PresymplecticLeapfrog
 from ._tableaus import (
@@ -18,7 +18,6 @@ from ._tableaus import (
     SOFRONIOU_SPALETTA_10,
     SUZUKI_4,
 )
-from ._wrapper import AbstractWrapper
 
 
 if TYPE_CHECKING:

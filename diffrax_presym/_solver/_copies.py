@@ -7,12 +7,10 @@ within a step is `y, (copy, field)`, with the velocity and force of the last exc
 from collections.abc import Callable
 from functools import partial
 
-import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike
 
-from .._misc import tree_add, tree_scale, values
+from .._misc import tree_add, tree_scale
 from .._split import State
 from .._system import System
 from ._engine import Move, Outcome, Span, Stage
@@ -95,10 +93,3 @@ def rotate(angle: Array, y: State, scale: ArrayLike = 1.0) -> State:
     q, p = y
     q1 = tree_add(tree_scale(cos, q), sin * scale, p)
     return q1, tree_add(tree_scale(cos, p), -sin / scale, q)
-
-
-def largest(x: State) -> Array:
-    """The largest absolute value of all entries."""
-    sizes = jtu.tree_map(lambda x: jnp.max(jnp.abs(x), initial=0), values(x))
-    with jax.numpy_dtype_promotion("standard"):
-        return jtu.tree_reduce(jnp.maximum, sizes)

@@ -3,15 +3,14 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import Array, Inexact
 
-from .._misc import as_parameter, as_positive, cast_to
+from .._misc import as_parameter, as_positive, cast_to, largest
 from .._split import State
 from .._system import System
 from ._base import AbstractMoveSolver, AbstractPresymplecticSolver
 from ._composition import rows
-from ._copies import exchange, largest, move_frames, rotate, separate
+from ._copies import exchange, move_frames, rotate, separate
 from ._engine import forward, Moves, Span, Stages
 from ._tableaus import (
     SOFRONIOU_SPALETTA_6,
@@ -105,7 +104,7 @@ class PresymplecticCoupled(AbstractMoveSolver[State]):
         return self.composed_order
 
     def start(self, system: System, t: Array, y: State) -> State:
-        return jtu.tree_map(jnp.zeros_like, system.values(y))
+        return system.zeros(y)
 
     def moves(self, system: System) -> Moves:
         return _free_step(self.composed_order, self._rotated)
@@ -198,6 +197,5 @@ class PresymplecticProjected(AbstractPresymplecticSolver[None]):
     ) -> tuple[State, None, None]:
         # The difference of the copies is dropped, so the step is not invertible.
         moves = _free_step(self.composed_order, lambda h, half: half)
-        zero = jtu.tree_map(jnp.zeros_like, system.values(y))
-        (y, _), _ = forward(moves, system, Span(t0, t1, h), (y, zero))
+        (y, _), _ = forward(moves, system, Span(t0, t1, h), (y, system.zeros(y)))
         return y, None, None

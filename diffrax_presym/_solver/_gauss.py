@@ -15,6 +15,9 @@ from jaxtyping import Array, Inexact, PyTree, Shaped
 from .._misc import (
     cast_to,
     check_root_finder,
+    is_sum,
+    largest,
+    rounding_errors,
     Sum,
     tree_add,
     tree_scale,
@@ -31,6 +34,7 @@ from ._collocation import (
     legendre,
     MAX_STAGES,
 )
+from ._moves import root_find, RootFind
 
 
 # Velocities and forces of all stages, times weight and length of the step, the forces
@@ -167,46 +171,44 @@ class PresymplecticGauss(AbstractPresymplecticSolver[_Carry]):
     def start(self, system: System, t: Array, y: State) -> _Carry:
         y = system.values(y)
         many = lambda x: jnp.zeros((self.stages, *jnp.shape(x)), jnp.result_type(x))
-        lost, slopes = jtu.tree_map(jnp.zeros_like, y), jtu.tree_map(many, y)
-        return _Carry(lost, slopes, jnp.zeros((), jnp.result_type(t)))
+        return _Carry(
+            system.zeros(y), jtu.tree_map(many, y), jnp.zeros((), jnp.result_type(t))
+        )
 
     def advance(
         self, system: System, t0: Array, t1: Array, h: Array, y: State, carry: _Carry
     ) -> tuple[State, _Carry, dfx.RESULTS]:
         # Within `Compensated` the leaves are sums already.
         sums = jtu.tree_map(
-            lambda x, lost: x if _is_sum(x) else Sum(x, lost),
+            lambda x, lost: x if is_sum(x) else Sum(x, lost),
             *(y, carry.lost),
-            is_leaf=_is_sum,
+            is_leaf=is_sum,
         )
-        value, lost = _part(sums, "value"), _part(sums, "lost")
-        step = _Step(system, gauss_table(self.stages), t0, h, value, lost)
+        parts = system.values(sums), rounding_errors(sums)
+        step = _Step(system, gauss_table(self.stages), t0, h, *parts)
         guess = step.extrapolate(carry.slopes, carry.h)
         slopes, result = self._solve(step, guess)
         sums = system.add(sums, 1, step.change(slopes))
         y = jtu.tree_map(
-            lambda x, new: new if _is_sum(x) else new.value,
+            lambda x, new: new if is_sum(x) else new.value,
             *(y, sums),
-            is_leaf=_is_sum,
+            is_leaf=is_sum,
         )
         # The solution depends on none of it, except by rounding.
-        carry = _Carry(_part(sums, "lost"), slopes, cast_to(h, carry.h))
+        carry = _Carry(rounding_errors(sums), slopes, cast_to(h, carry.h))
         return y, lax.stop_gradient(carry), result
 
     def _solve(self, step: "_Step", guess: Slopes) -> tuple[Slopes, dfx.RESULTS]:
         if self.root_finder is None:
             find = lambda guess: _iterate(step, guess, self.max_iterations)
         else:
-            finder = self.root_finder
-            find = lambda guess: _find_root(step, guess, finder, self.max_iterations)
+            by_finder = root_find(self.root_finder, self.max_iterations)
+            find = lambda guess: _find_root(step, guess, by_finder)
         return _implicit(step, find, guess, self._tangent)
 
     @property
     def _tangent(self):
         return _contract if self.root_finder is None else _factorise
-
-    def slope(self, system: System, t, y: State, carry: _Carry) -> State:
-        return system.slope(t, y)
 
     def dense_info(self, system: System, t0, t1, h, start, end) -> dict[str, PyTree]:
         (y0, carry0), (y1, carry1) = start, end
@@ -220,13 +222,6 @@ class PresymplecticGauss(AbstractPresymplecticSolver[_Carry]):
         k0 = tree_scale(h, self.slope(system, t0, y0, carry0))
         k1 = tree_scale(h, self.slope(system, t1, y1, carry1))
         return dict(y0=y0, y1=y1, slopes=step.dense(slopes, k0, k1))
-
-
-_is_sum = lambda x: isinstance(x, Sum)
-
-
-def _part(sums: PyTree, name: str) -> PyTree:
-    return jtu.tree_map(lambda s: getattr(s, name), sums, is_leaf=_is_sum)
 
 
 def _check_number(x, most: int | None, name: str) -> None:
@@ -440,20 +435,13 @@ def _iterate(step: _Step, guess: Slopes, max_iterations: int):
     return search.slopes, results.where(converged, results.successful, failure)
 
 
-def _find_root(step: _Step, guess: Slopes, root_finder, max_iterations: int):
+def _find_root(step: _Step, guess: Slopes, find: RootFind):
     nothing = jtu.tree_map(jnp.zeros_like, guess)
     # Extrapolation of stiff components may be inaccurate.
-    sizes = (_largest(step.residual(x)) for x in (guess, nothing))
+    sizes = (largest(step.residual(x)) for x in (guess, nothing))
     better = jnp.less(*sizes)
     guess = jtu.tree_map(lambda x: jnp.where(better, x, 0), guess)
-    solution = optx.root_find(
-        lambda slopes, _: step.residual(slopes),
-        root_finder,
-        guess,
-        max_steps=max_iterations,
-        throw=False,
-    )
-    return solution.value, dfx.RESULTS.promote(solution.result)
+    return find(lambda slopes: step.slopes(step.stages(slopes)), guess)
 
 
 def _lowest(x: PyTree):
@@ -474,12 +462,6 @@ def _change(x: PyTree, y: PyTree, dtype) -> Inexact[Array, ""]:
     return jtu.tree_reduce(jnp.maximum, jtu.tree_map(leaf, x, y), jnp.zeros((), dtype))
 
 
-def _largest(x: PyTree) -> Inexact[Array, ""]:
-    sizes = jtu.tree_map(lambda x: jnp.max(jnp.abs(x), initial=0), x)
-    with jax.numpy_dtype_promotion("standard"):
-        return jtu.tree_reduce(jnp.maximum, sizes)
-
-
 def _contract(g, y: Slopes) -> Slopes:
     """Solve a linear system of a residual by the same iteration."""
 
@@ -488,7 +470,7 @@ def _contract(g, y: Slopes) -> Slopes:
         def iterate(state):
             x, _, least, stalled, count = state
             new = tree_sub(tree_sum(x, g(x)), b)
-            change, size = _largest(tree_sub(new, x)), _largest(new)
+            change, size = largest(tree_sub(new, x)), largest(new)
             stalled = jnp.where(change < least, 0, stalled + 1)
             going = (change > eps / 8 * size) & (stalled < 3)
             return new, going, jnp.minimum(change, least), stalled, count + 1
@@ -498,7 +480,7 @@ def _contract(g, y: Slopes) -> Slopes:
         state = (
             start,
             jnp.array(True),
-            jnp.asarray(jnp.inf, _largest(b).dtype),
+            jnp.asarray(jnp.inf, largest(b).dtype),
             jnp.asarray(0),
             jnp.asarray(0),
         )
@@ -506,7 +488,7 @@ def _contract(g, y: Slopes) -> Slopes:
             lambda state: state[1] & (state[-1] < 200), iterate, state
         )
         # Never numbers as if nothing had happened.
-        solved = ~going & (least <= eps ** (1 / 2) * _largest(x))
+        solved = ~going & (least <= eps ** (1 / 2) * largest(x))
         return jtu.tree_map(lambda x: jnp.where(solved, x, jnp.nan), x)
 
     return lax.custom_linear_solve(g, y, solve, transpose_solve=solve)

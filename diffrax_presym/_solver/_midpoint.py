@@ -58,7 +58,7 @@ class PresymplecticMidpoint(AbstractMoveSolver[None]):
                 inside = system.add(y, 1, dy)
                 return system.velocity(middle, inside), system.force(middle, inside)
 
-            dy, result = find(lambda dy: tree_scale(half, field(dy)), system.values(y))
+            dy, result = find(lambda dy: tree_scale(half, field(dy)), system.zeros(y))
             q, p = system.add(y, 2, dy)
             return ((q, system.move_frame(middle, half, p)), carry), result
 

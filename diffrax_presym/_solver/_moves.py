@@ -7,12 +7,11 @@ of the last kick, or `None` if the scheme does not reuse it.
 from collections.abc import Callable
 
 import diffrax as dfx
-import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import PyTree
 
-from .._misc import all_finite, Sum, tree_scale, tree_sub
+from .._misc import all_finite, rounding_errors, Sum, tree_scale, tree_sub
 from .._split import AbstractSplit
 from .._system import NONFINITE, System
 from ._engine import Move, Outcome, Span, Stage
@@ -79,14 +78,14 @@ RootFind = Callable[[Callable, PyTree], tuple[PyTree, dfx.RESULTS]]
 
 
 def root_find(root_finder: optx.AbstractRootFinder | None, max_steps: int) -> RootFind:
-    """A root find for `dx = fn(dx)`, the change of part of a state like `x`."""
+    """A root find for `x = fn(x)`, from a guess."""
 
-    def find(fn: Callable, x: PyTree) -> tuple[PyTree, dfx.RESULTS]:
+    def find(fn: Callable, guess: PyTree) -> tuple[PyTree, dfx.RESULTS]:
         assert root_finder is not None  # the scheme has checked that there is one
         solution = optx.root_find(
-            lambda dx, _: tree_sub(fn(dx), dx),
+            lambda x, _: tree_sub(fn(x), x),
             root_finder,
-            jtu.tree_map(jnp.zeros_like, x),
+            guess,
             max_steps=max_steps,
             throw=False,
         )
@@ -106,7 +105,7 @@ def frozen_kick(find: RootFind, known: bool = False) -> Move:
             return before(system, span, stage)
         (q, p), carry = stage
         force = lambda dp: system.force(span.t0, (q, system.add(p, 1, dp)))
-        dp, result = find(lambda dp: tree_scale(span.h, force(dp)), system.values(p))
+        dp, result = find(lambda dp: tree_scale(span.h, force(dp)), system.zeros(p))
         return ((q, system.add(p, 1, dp)), carry), result
 
     return Move(_known_kick if known else after, before)
@@ -127,7 +126,7 @@ def frozen_drift(find: RootFind) -> Move:
             q = system.add(q, span.h, system.velocity(span.t1, (q, p)))
             return ((q, p), carry), None
         velocity = lambda dq: system.velocity(span.t1, (system.add(q, 1, dq), p))
-        dq, result = find(lambda dq: tree_scale(span.h, velocity(dq)), system.values(q))
+        dq, result = find(lambda dq: tree_scale(span.h, velocity(dq)), system.zeros(q))
         return ((system.add(q, 1, dq), p), carry), result
 
     return Move(start, end)
@@ -148,9 +147,7 @@ def _to_sums(system: System, span: Span, stage: Stage) -> Outcome:
 
 def _from_sums(system: System, span: Span, stage: Stage) -> Outcome:
     y, carry = stage
-    rounded = system.values(y)
-    exact = jtu.tree_map(lambda x: Sum(x, jnp.zeros_like(x)), rounded)
-    return (rounded, (carry, system.subtract(y, exact))), None
+    return (system.values(y), (carry, rounding_errors(y))), None
 
 
 check_finite = Move(_check_finite, _check_finite)

@@ -2,11 +2,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
 
-from .._misc import as_positive, cast_to, tree_sub
+from .._misc import as_positive, cast_to, largest, tree_sub
 from .._split import State
 from .._system import System
 from ._base import AbstractMoveSolver
-from ._copies import coupling, exchange, largest, move_frames, paired_field
+from ._copies import coupling, exchange, move_frames, paired_field
 from ._engine import Moves, Stages
 
 
