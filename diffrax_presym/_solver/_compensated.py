@@ -11,15 +11,16 @@ from ._moves import to_sums
 
 
 class Compensated(AbstractWrapper[PyTree]):
-    """Any explicit scheme, with compensated summation.
+    """Any scheme, with compensated summation.
 
     Order, structure, evaluations per step and dense/ts output are those of the base.
     Each kick and each drift adds a small number to a large one. The rounding error is
     kept in the `solver_state` and added to the next increment, so that the remaining
     error is smaller by about a factor of the step size.
 
-    For very many steps without damping, especially in `float32`. Not for nonseparable
-    energies, nor for strong friction, which damps rounding errors anyway.
+    For very many steps without damping, especially in `float32`. Not for strong
+    friction, which damps rounding errors anyway, nor for implicit schemes whose root
+    finder is less accurate than rounding.
 
     ??? cite "Reference"
 
@@ -44,8 +45,7 @@ class Compensated(AbstractWrapper[PyTree]):
     def __init__(self, base: AbstractPresymplecticSolver, length=None):
         """**Arguments:**
 
-        - `base`: a presymplectic solver made of kicks and drifts: Euler, leapfrog, or a
-            composition or splitting.
+        - `base`: any presymplectic solver.
         - `length`: the step size, if it is constant: the `dt0` of the solve. It
             replaces the difference of two times where the two agree to the rounding of
             the times. In `float32` this matters as much as the rest: at a time of 1e4,
@@ -54,7 +54,7 @@ class Compensated(AbstractWrapper[PyTree]):
         **Raises:**
 
         `ValueError` if `base` is not a presymplectic solver or `length` is known not to
-        be positive; and when the solve is traced, if the Hamiltonian is not separable.
+        be positive.
         """
         self.base = base
         self.length = (
