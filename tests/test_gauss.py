@@ -63,9 +63,9 @@ PENDULUM = (jnp.array([1.0, 1.5]), jnp.array([0.3, -0.2]))
 def test_coefficients_are_right_to_the_last_digit(stages):
     table = gauss_table(stages)
     with mpmath.workdps(50):
-        coefficients = mpmath.taylor(lambda x: mpmath.legendre(stages, x), 0, stages)
-        roots = mpmath.polyroots(coefficients[::-1], maxsteps=200, extraprec=200)
-        c = sorted((1 + mpmath.re(x)) / 2 for x in roots)
+        legendre = lambda x: mpmath.legendre(stages, x)
+        guesses, _ = np.polynomial.legendre.leggauss(stages)
+        c = sorted((1 + mpmath.findroot(legendre, float(x))) / 2 for x in guesses)
         powers = mpmath.matrix(stages, stages)
         for k in range(stages):
             for j in range(stages):
