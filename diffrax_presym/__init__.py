@@ -1,7 +1,10 @@
 """Presymplectic integrators for Diffrax."""
 
 from . import diagnostics as diagnostics
-from ._adjoint import ReversibleAdjoint as ReversibleAdjoint
+from ._adjoint import (
+    FixedStepAdjoint as FixedStepAdjoint,
+    ReversibleAdjoint as ReversibleAdjoint,
+)
 from ._friction import (
     AbstractDamping as AbstractDamping,
     AbstractFriction as AbstractFriction,
@@ -43,7 +46,6 @@ from ._solver import (
     BlanesMoanRKN4 as BlanesMoanRKN4,
     BlanesMoanRKN6 as BlanesMoanRKN6,
     Checked as Checked,
-    CollocationInterpolation as CollocationInterpolation,
     Compensated as Compensated,
     Composition as Composition,
     PresymplecticCoupled as PresymplecticCoupled,

@@ -1,8 +1,11 @@
 import abc
+import functools
+import math
 
 import diffrax as dfx
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, PyTree
 
 from ._misc import cast_to
@@ -28,35 +31,52 @@ class AbstractStepInterpolation(dfx.AbstractLocalInterpolation):
 
 
 class HermiteInterpolation(AbstractStepInterpolation):
-    """Hermite interpolation of a step from values and derivatives at its two ends.
+    """Hermite interpolation of a step, from values and derivatives at several points.
 
-    Exact at both ends. Cubic from first derivatives, with an error of fourth order in
-    the step; quintic if second derivatives are given too, with an error of sixth order.
+    Exact at both ends. From the two ends alone it is cubic, with an error of fourth
+    order in the length of the step. Each point between them, where the solution is a
+    shorter step of the scheme, adds two orders.
     """
 
     t0: PyTree
     t1: PyTree
     y0: PyTree
     y1: PyTree
-    # First and second derivatives, times the step size and its square.
+    # Derivatives, times the length of the step.
     k0: PyTree
     k1: PyTree
-    b0: PyTree = None
-    b1: PyTree = None
+    # Values and derivatives at the points of `inner_points`, stacked.
+    inner: tuple[PyTree, PyTree] | None = None
 
     def at_fraction(self, s: Array) -> PyTree:
-        seconds = () if self.b0 is None else (self.b0, self.b1)
-        ends = (self.y0, self.y1, self.k0, self.k1, *seconds)
-        return jtu.tree_map(lambda *x: _hermite(cast_to(s, x[0]), *x), *ends)
+        ends = self.y0, self.y1, self.k0, self.k1
+        inner = () if self.inner is None else self.inner
+        return jtu.tree_map(lambda *x: _hermite(cast_to(s, x[0]), *x), *ends, *inner)
 
 
-def _hermite(s, y0, y1, k0, k1, b0=None, b1=None):
-    r = 1 - s
+@functools.cache
+def inner_points(number: int) -> np.ndarray:
+    """The points of a step, as fractions, of which Hermite interpolation uses values
+    and derivatives besides the ends: the Lobatto points."""
+    legendre = np.polynomial.legendre.Legendre.basis(number + 1)
+    return np.sort((1 + legendre.deriv().roots().real) / 2)
+
+
+def _hermite(s, y0, y1, k0, k1, inner=(), slopes=()):
+    number = len(inner)
+    points = [0.0, *inner_points(number).tolist(), 1.0]
     jump = y1 - y0
-    y = r * y0 + s * y1 - s * r * ((r - s) * jump - r * k0 + s * k1)
-    if b0 is None:
-        return y
-    # The errors of the second derivatives of the cubic.
-    miss0 = b0 - (6 * jump - 4 * k0 - 2 * k1)
-    miss1 = b1 - (2 * k0 + 4 * k1 - 6 * jump)
-    return y + (s * r) ** 2 * (r * miss0 + s * miss1) / 2
+    y = (1 - s) * y0 + s * y1
+    # The rest is zero at both ends, and is interpolated by squares of the Lagrange
+    # polynomials.
+    for i, c in enumerate(points):
+        others = [d for d in points if d != c]
+        lagrange = math.prod((s - d) / (c - d) for d in others) ** 2
+        if i in (0, number + 1):
+            y = y + (s - c) * lagrange * ((k1 if i else k0) - jump)
+            continue
+        value, slope = inner[i - 1], slopes[i - 1]
+        rest = value - ((1 - c) * y0 + c * y1)
+        steep = 2 * sum(1 / (c - d) for d in others)
+        y = y + lagrange * (rest + (s - c) * (slope - jump - steep * rest))
+    return y

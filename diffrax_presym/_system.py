@@ -4,7 +4,6 @@ from typing import Any, TypeVar
 
 import diffrax as dfx
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, PyTree
@@ -91,11 +90,6 @@ class System(eqx.Module):
         if self.friction is not None:
             force = self.friction.net_force(t, force, y[1])
         return velocity, force
-
-    def second_derivative(self, t: Time, y: State, slope: State) -> State:
-        """The derivative of the vector field along the motion."""
-        y = values(y)
-        return jax.jvp(self.slope, (t, y), (jnp.ones_like(t), slope))[1]
 
     def check(self, t: Time, y: State) -> dfx.RESULTS | None:
         """A failure where the energy is not defined; `None` if that is not checked."""

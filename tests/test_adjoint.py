@@ -16,10 +16,25 @@ from helpers import assert_close, each, IMPLICIT, mixed_energy, Scheme, SCHEMES
 from jax.flatten_util import ravel_pytree
 
 import diffrax_presym as dps
-from diffrax_presym._adjoint._clock import clock
+from diffrax_presym._adjoint._base import AbstractFixedStepAdjoint
+from diffrax_presym._loop import run, Steps
+
+
+class ForwardMode(AbstractFixedStepAdjoint):
+    """The same loop without a rule for its derivative, for forward mode."""
+
+    def keep(self, plan):
+        raise NotImplementedError
+
+    def back(self, backward):
+        raise NotImplementedError
+
+    def solve(self, inputs):
+        return run(inputs)[0]
 
 
 REVERSIBLE = dps.ReversibleAdjoint()
+FIXED_STEP = dps.FixedStepAdjoint()
 CHECKPOINTED = dfx.RecursiveCheckpointAdjoint()
 LEAPFROG = dps.PresymplecticLeapfrog()
 Y0 = (jnp.array([1.0, 0.5]), jnp.array([0.0, 0.3]))
@@ -83,17 +98,19 @@ def by_forward_mode(inputs, kwargs):
     numbers, unravel = ravel_pytree(inputs)
 
     def of_numbers(numbers):
-        out = value(unravel(numbers), dfx.ForwardMode(), kwargs)
+        out = value(unravel(numbers), ForwardMode(), kwargs)
         return out, out
 
     gradient, out = jax.jacfwd(of_numbers, has_aux=True)(numbers)
     return out, unravel(gradient)
 
 
-def check(tolerance=1e-12, **kwargs):
-    ours = value_and_gradient(INPUTS, REVERSIBLE, kwargs)
-    assert_close(ours, by_forward_mode(INPUTS, kwargs), tolerance)
-    assert all(np.all(x != 0) for x in jtu.tree_leaves(ours[1]))
+def check(tolerance=1e-12, adjoints=(REVERSIBLE,), **kwargs):
+    exact = by_forward_mode(INPUTS, kwargs)
+    assert all(np.all(x != 0) for x in jtu.tree_leaves(exact[1]))
+    for adjoint in adjoints:
+        ours = value_and_gradient(INPUTS, adjoint, kwargs)
+        assert_close(ours, exact, tolerance)
 
 
 def named(schemes, *names):
@@ -160,7 +177,8 @@ def test_cotangents_of_all_that_is_saved(saveat):
         return sign * x if eqx.is_array(x) else x
 
     saveat = jtu.tree_map(turn, dfx.SaveAt(**saveat))
-    check(saveat=saveat, t1=sign * 1.0, dt0=sign * 0.3)
+    both = REVERSIBLE, FIXED_STEP
+    check(saveat=saveat, t1=sign * 1.0, dt0=sign * 0.3, adjoints=both)
 
 
 @pytest.mark.slow
@@ -191,13 +209,17 @@ def test_steps_are_found_again_to_rounding(t0, t1, dt0, dtype):
     y0 = (jnp.ones(1, dtype), jnp.zeros(1, dtype))
     sol = _saving_steps(t0, t1, dt0, y0)
     n = int(sol.stats["num_steps"])
-    time = clock(dfx.ConstantStepSize(), t0, t1, dt0)
     with jax.numpy_dtype_promotion("standard"):  # as within `diffeqsolve`
-        times = jax.vmap(time)(jnp.arange(n + 1))
+        steps = Steps(dfx.ConstantStepSize(), t0, t1, dt0)
+        times = steps.time(jnp.arange(n + 1))
+        middle = (times[:-1] + times[1:]) / 2
     ulp = jnp.finfo(dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
     assert sol.ts is not None and n > 0
     assert jnp.all(jnp.abs(sol.ts[: n + 1] - times) <= 2 * ulp)
-    assert sol.ts[0] == times[0] and sol.ts[n] == times[n]
+    assert sol.ts[0] == times[0] and sol.ts[n] == times[n] and steps.total == n
+    with jax.numpy_dtype_promotion("standard"):
+        assert jnp.all(steps.holding(times[1:]) == jnp.arange(n))
+        assert jnp.all(steps.holding(middle) == jnp.arange(n))
 
 
 def test_a_solve_of_no_length():
@@ -216,7 +238,7 @@ def test_gradients_of_what_a_saved_function_closes_over():
 
         return jax.grad(loss)(jnp.asarray(np.float64(0.7)))
 
-    assert_close(gradient(REVERSIBLE), gradient(CHECKPOINTED), 1e-13)
+    assert_close(gradient(REVERSIBLE), gradient(FIXED_STEP), 1e-13)
 
 
 class Bowl(eqx.Module):
@@ -391,12 +413,12 @@ def strongly_damped(adjoint, eta, dtype: Any = jnp.float64):
 
 @pytest.mark.parametrize("eta", [10.0, 100.0, 1000.0])
 def test_kept_states_make_up_for_what_damping_forgets(eta):
-    exact = strongly_damped(CHECKPOINTED, eta)
+    exact = strongly_damped(FIXED_STEP, eta)
     assert_close(strongly_damped(REVERSIBLE, eta), exact, 1e-10)
 
 
 def test_kept_states_in_single_precision():
-    exact = strongly_damped(CHECKPOINTED, 100.0)
+    exact = strongly_damped(FIXED_STEP, 100.0)
     single = strongly_damped(REVERSIBLE, 100.0, jnp.float32)
     assert all(x.dtype == jnp.float32 for x in jtu.tree_leaves(single))
     assert_close(single, exact, 1e-4)
@@ -409,7 +431,7 @@ def test_a_gradient_that_is_off_is_an_error():
             jax.block_until_ready(strongly_damped(adjoint, eta))
     assert_close(
         strongly_damped(dps.ReversibleAdjoint(checkpoints=0), 1.0),
-        strongly_damped(CHECKPOINTED, 1.0),
+        strongly_damped(FIXED_STEP, 1.0),
         1e-11,
     )
 
@@ -444,8 +466,8 @@ def controlled(controller: Any, event: Any = None):
     [
         (lambda: solve(INPUTS, REVERSIBLE, dfx.Tsit5()), "Tsit5"),
         (
-            lambda: solve(INPUTS, REVERSIBLE, dps.PresymplecticProjected()),
-            "PresymplecticProjected",
+            lambda: solve(INPUTS, FIXED_STEP, dfx.Tsit5()),
+            "FixedStepAdjoint.*Tsit5",
         ),
         (
             lambda: solve(INPUTS, REVERSIBLE, dfx.HalfSolver(LEAPFROG)),
@@ -462,17 +484,32 @@ def controlled(controller: Any, event: Any = None):
             "times",
         ),
     ],
-    ids=["solver", "projected", "adaptive", "event", "time"],
+    ids=["solver", "other solver", "adaptive", "event", "time"],
 )
 def test_what_is_not_supported_names_what_is(wrong, what):
     with pytest.raises(ValueError, match=f"{what}.*RecursiveCheckpointAdjoint"):
         wrong()
 
 
+def test_schemes_that_cannot_be_reversed_have_another_adjoint():
+    projected = dps.PresymplecticProjected()
+    with pytest.raises(ValueError, match="Projected.*FixedStepAdjoint"):
+        solve(INPUTS, REVERSIBLE, projected)
+    check(solver=projected, system=nonseparable, adjoints=(FIXED_STEP,))
+
+
+def test_gradients_by_checkpoints_need_max_steps():
+    with pytest.raises(ValueError, match="max_steps"):
+        value_and_gradient(INPUTS, FIXED_STEP, dict(max_steps=None))
+    value(INPUTS, FIXED_STEP, dict(max_steps=None))
+
+
 @pytest.mark.parametrize("kwargs", [dict(checkpoints=-1), dict(tol=0.0)])
 def test_bad_options(kwargs):
     with pytest.raises(ValueError, match=next(iter(kwargs))):
         dps.ReversibleAdjoint(**kwargs)
+    with pytest.raises(ValueError, match="checkpoints"):
+        dps.FixedStepAdjoint(checkpoints=-1)
 
 
 # Where functions may hold what is differentiated.

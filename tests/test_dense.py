@@ -11,6 +11,7 @@ import pytest
 from helpers import assert_close, CARRIES, each, flat, pendulum, Scheme, solve
 
 import diffrax_presym as dps
+from diffrax_presym._interpolation import inner_points
 
 
 SYSTEM = dps.DissipativeHamiltonian(
@@ -32,7 +33,7 @@ SOLVERS = {
     "BlanesMoanRKN4": (dps.BlanesMoanRKN4(), 4),
     "BlanesMoanRKN6": (dps.BlanesMoanRKN6(), 6),
     "BlanesMoan6": (dps.BlanesMoan6(), 6),
-    "SofroniouSpaletta8": (dps.SofroniouSpaletta8(), 6),
+    "SofroniouSpaletta8": (dps.SofroniouSpaletta8(), 8),
     "Tao": (dps.PresymplecticTao(5.0), 2),
 }
 
@@ -176,6 +177,7 @@ def test_value_and_slope_at_the_steps_of_every_scheme(scheme: Scheme, t0, t1):
 
 CUBIC = np.array([0.3, -1.0, 0.5, 2.0])
 QUINTIC = np.array([0.2, 0.1, -0.7, 0.4, -1.0, 1.5])
+NONIC = np.array([0.05, -0.1, 0.03, 0.2, *QUINTIC])
 
 
 def value(polynomial, t, m=0):
@@ -184,39 +186,45 @@ def value(polynomial, t, m=0):
     return {"a": jnp.array([x, 2 * x]), "b": (x,)}
 
 
-def hermite(polynomial, t0, t1, second):
+def hermite(polynomial, t0, t1, number):
     scaled = lambda t, m: jax.tree.map(
         lambda x: (t1 - t0) ** m * x, value(polynomial, t, m)
     )
     ends = dict(y0=scaled(t0, 0), y1=scaled(t1, 0), k0=scaled(t0, 1), k1=scaled(t1, 1))
-    if second:
-        ends |= dict(b0=scaled(t0, 2), b1=scaled(t1, 2))
+    if number:
+        times = [t0 + (t1 - t0) * x for x in inner_points(number)]
+        stack = lambda m: jax.tree.map(
+            lambda *x: jnp.stack(x), *(scaled(t, m) for t in times)
+        )
+        ends |= dict(inner=(stack(0), stack(1)))
     return dps.HermiteInterpolation(t0=jnp.array(t0), t1=jnp.array(t1), **ends)
 
 
 @pytest.mark.parametrize("t0, t1", [(0.5, 2.0), (2.0, 0.5)])
 @pytest.mark.parametrize(
-    "polynomial, second", [(CUBIC, False), (QUINTIC, True)], ids=["cubic", "quintic"]
+    "polynomial, number",
+    [(CUBIC, 0), (QUINTIC, 1), (NONIC, 3)],
+    ids=["cubic", "quintic", "nonic"],
 )
-def test_polynomials_are_met_exactly(polynomial, second, t0, t1):
-    step = hermite(polynomial, t0, t1, second)
+def test_polynomials_are_met_exactly(polynomial, number, t0, t1):
+    step = hermite(polynomial, t0, t1, number)
     for t in (0.5, 0.8, 1.4, 2.0):
         assert_close(step.evaluate(jnp.array(t)), value(polynomial, t), 1e-14)
         assert_close(step.derivative(jnp.array(t)), value(polynomial, t, 1), 1e-13)
 
 
 def test_a_quintic_is_no_cubic():
-    y = hermite(QUINTIC, 0.5, 2.0, second=False).evaluate(jnp.array(1.4))
+    y = hermite(QUINTIC, 0.5, 2.0, 0).evaluate(jnp.array(1.4))
     assert np.max(np.abs(flat(y) - flat(value(QUINTIC, 1.4)))) > 1e-3
 
 
-@pytest.mark.parametrize("second", [False, True], ids=["cubic", "quintic"])
-def test_a_step_of_no_length_has_a_derivative(second):
+@pytest.mark.parametrize("number", [0, 3], ids=["cubic", "nonic"])
+def test_a_step_of_no_length_has_a_derivative(number):
     # As under `vmap`, when one solve terminates before the others.
-    step = hermite(QUINTIC, 1.0, 1.0, second)
+    step = hermite(QUINTIC, 1.0, 1.0, number)
 
     def first(y0):
-        ends = dict(k0=step.k0, k1=step.k1, b0=step.b0, b1=step.b1)
+        ends = dict(k0=step.k0, k1=step.k1, inner=step.inner)
         at = dps.HermiteInterpolation(t0=step.t0, t1=step.t1, y0=y0, y1=y0, **ends)
         return at.evaluate(jnp.array(1.0))["b"][0]
 

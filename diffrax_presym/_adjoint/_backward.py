@@ -1,125 +1,238 @@
-"""The backward pass through the steps of a solve."""
+"""The backward pass through the steps of a solve, and through what was saved."""
 
-from typing import Any
+from collections.abc import Callable
+from functools import partial, reduce
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
+from .._loop import Inputs, Plan, Trace
 from .._misc import tree_sum
 from .._solver._engine import Span, undo, vjp, vjp_step
-from ._clock import clock
-from ._interpolated import pull_interpolated
-from ._saves import is_within, materialise, Saved, SavedOutputs
-from ._types import Inputs, Position
+
+
+class Position(NamedTuple):
+    """How far the backward pass has come."""
+
+    n: Array  # the number of steps left
+    state: tuple[PyTree, PyTree]
+    bar: tuple[PyTree, PyTree]  # the cotangents of the state
+    gradient: PyTree  # the cotangents of the parameters so far
+    left: list[Array]  # the number of outputs left, of each kind
+
+
+class _Saved(NamedTuple):
+    """Outputs of one kind, in the order of time."""
+
+    number: Array
+    step: Callable[[Array], Array]  # the step at whose start each is computed
+    pull: Callable[[Position, Array], tuple[PyTree, PyTree]]
 
 
 class Backward:
     """The backward pass through a solve, step by step."""
 
-    def __init__(self, inputs: Inputs, perturbed: Inputs, final, cotangents):
-        rest = inputs.rest
-        self.solver, self.first, self.final = rest["solver"], inputs.start, final
-        self.time = clock(
-            *(rest[x] for x in ("stepsize_controller", "t0", "t1", "dt0"))
-        )
-        self.system, _ = inputs.parameters
+    def __init__(self, inputs: Inputs, perturbed: Inputs, final, trace: Trace, bars):
+        self.plan, self.trace = Plan(inputs), trace
+        self.system, self.solver = self.plan.system, self.plan.solver
         # The differentiated leaves of the system, and of all parameters.
         self.wanted, _ = perturbed.parameters
         self.moved, self.fixed = eqx.partition(inputs.parameters, perturbed.parameters)
-        saved = rest["saveat"], final, cotangents, self.moved, self.fixed
-        self.saves = SavedOutputs(*saved)
-        self.dense = materialise(final.dense_infos, cotangents.dense_infos)
-        self.carried = materialise(final.solver_state, cotangents.solver_state)
+        self.finite = [jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(trace.end[0])]
+        self.dense = _materialise(final.dense_infos, bars.dense_infos)
+        self.carried = _materialise(final.solver_state, bars.solver_state)
+        split = self.plan.structure.flatten_up_to
+        self.bars = [
+            _materialise(save.ys, bar.ys)
+            for save, bar in zip(
+                split(final.save_state), split(bars.save_state), strict=True
+            )
+        ]
 
     def span(self, n: Array) -> Span:
         """The span of step `n`, in physical time."""
-        t0, t1 = (self.system.time(self.time(i)) for i in (n, n + 1))
+        t0, t1 = (self.system.time(self.plan.steps.time(i)) for i in (n, n + 1))
         return Span(t0, t1, self.solver.step_length(t0, t1))
 
     def advance(self, n: Array, state: PyTree) -> PyTree:
+        """The state after step `n`."""
         return self.solver.advance(self.system, *self.span(n), *state)[:2]
 
     def end(self) -> Position:
-        y, carry, n = self.final.y, self.final.solver_state, self.final.num_steps
-        bar = jtu.tree_map(jnp.zeros_like, y), self.carried
-        gradient = jtu.tree_map(jnp.zeros_like, self.moved)
-        left = self.saves.left_at_end(n)
-        at = Position(n, self.time(n), (y, carry), bar, gradient, left)
-        for i, sub in enumerate(self.saves.subs):
-            # The end may have been saved as a step already.
-            if sub.t1 and sub.steps != 1:
-                here = sub.steps == 0 or n % sub.steps != 0
-                at = self._pull_output(at, i, left[i].outputs, here)
-        return at
+        """The end of the solve, where also outputs between steps are pulled back to
+        the starts of their steps, if they were all computed at once."""
+        n, plan, state = self.trace.n, self.plan, self.trace.end
+        zeros = partial(jtu.tree_map, jnp.zeros_like)
+        gradient, bar = zeros(self.moved), (zeros(state[0]), self.carried)
+        self.saved: list[_Saved] = []
+        for i, output in enumerate(plan.outputs):
+            if output.t1:
+                row = self._row(i, output.saved(n), output.end_is_separate(n))
+                pulled = self._pull_state(i, n, state, row)
+                gradient, bar = tree_sum((gradient, bar), pulled)
+            if output.every:
+                self.saved.append(self._every(i))
+            if len(output.held):
+                starts = self.trace.starts[i]
+                pull = partial(self._pull_time, i)
+                if starts is not None:
+                    more, rows = self._pull_all(i, starts)
+                    gradient = tree_sum(gradient, more)
+                    pull = lambda at, j, rows=rows: (
+                        zeros(self.moved),
+                        jtu.tree_map(lambda x: x[j], rows),
+                    )
+                held = jnp.where(output.empty, 0, output.held)
+                step = lambda j, held=held: held[j]
+                self.saved.append(_Saved(output.times(n), step, pull))
+        return Position(n, state, bar, gradient, [x.number for x in self.saved])
 
     def start(self, at: Position) -> Position:
-        """Pull back the outputs saved at the start, more than one only for a solve of
-        zero length."""
-        for i, left in enumerate(at.left):
-            bar = self.saves.sum_of_first(i, left.outputs)
-            at = _add(at, self.saves.pull_saved_output(i, at.t, at.state[0], bar))
+        """Pull back the outputs of `t0`."""
+        for i, output in enumerate(self.plan.outputs):
+            if output.first:
+                row = self._row(i, jnp.asarray(0), True)
+                at = _add(at, self._pull_state(i, at.n, at.state, row))
         return at
+
+    def back_to(self, at: Position, first: Array, start: Callable) -> Position:
+        """All steps back to the start of step `first`, and what was saved there.
+
+        `start` gives the state at the start of a step, if it is known.
+        """
+
+        def due(at: Position) -> list[Array]:
+            pairs = zip(self.saved, at.left, strict=True)
+            return [jnp.where(x > 0, saved.step(x - 1), -1) for saved, x in pairs]
+
+        def steps(at: Position, stop: Array) -> Position:
+            back = lambda at: self.step(at, start(at.n - 1))
+            return lax.while_loop(lambda at: at.n > stop, back, at)
+
+        if not self.saved:
+            return steps(at, first)
+
+        def more(at: Position):
+            return (at.n > first) | (reduce(jnp.maximum, due(at)) == at.n)
+
+        def stop(at: Position) -> Position:
+            wanted = due(at)
+            at = steps(at, reduce(jnp.maximum, wanted, first))
+            for k, (saved, step) in enumerate(zip(self.saved, wanted, strict=True)):
+                hit = step == at.n
+                left = list(at.left)
+                pull = lambda at, saved=saved, left=left, k=k: _add(
+                    at, saved.pull(at, left[k] - 1)
+                )
+                at = lax.cond(hit, pull, lambda at: at, at)
+                left[k] = left[k] - jnp.where(hit, 1, 0)
+                at = at._replace(left=left)
+            return at
+
+        return lax.while_loop(more, stop, at)
 
     def step(self, at: Position, start: Any = None) -> Position:
         """One step back; `start` is the state at its start, if known."""
-        n, system, solver = at.n - 1, self.system, self.solver
-        span, moves = self.span(n), solver.moves(system)
-        for i, sub in enumerate(self.saves.subs):
-            if sub.steps != 0:
-                at = self._unsave_step(at, i, at.n % sub.steps == 0)
-        start_bar = jtu.tree_map(jnp.zeros_like, at.bar)
-        if self._may_interpolate():
-            # Most steps have no output between their ends, and are cheaper.
-            inner = lambda at: pull_interpolated(
-                self,
-                at,
-                n,
-                span,
-                undo(moves, system, span, at.state) if start is None else start,
-            )
-            skip = lambda at: (at, start_bar)
-            at, start_bar = lax.cond(self._interpolates(at.left, n), inner, skip, at)
+        n, system = at.n - 1, self.system
+        span, moves = self.span(n), self.solver.moves(system)
+        if self.dense is None:
+            start_bar = jtu.tree_map(jnp.zeros_like, at.bar)
+        else:
+            if start is None:
+                start = undo(moves, system, span, at.state)
+            at, start_bar = self._pull_dense(at, n, span, start)
         if start is None:
-            pulled = vjp_step(moves, system, self.wanted, span, at.state, at.bar)
-            start, more, bar = pulled
+            args = moves, system, self.wanted, span, at.state, at.bar
+            start, more, bar = vjp_step(*args)
         else:
             more, bar = vjp(moves, system, self.wanted, span, start, at.bar)
         more = (more, jtu.tree_map(jnp.zeros_like, self.moved[1]))
         gradient, bar = tree_sum((at.gradient, bar), (more, start_bar))
-        return Position(n, self.time(n), start, bar, gradient, at.left)
+        return Position(n, start, bar, gradient, at.left)
 
-    def _may_interpolate(self) -> bool:
-        return self.dense is not None or any(s.ts is not None for s in self.saves.subs)
+    def _every(self, i: int) -> _Saved:
+        """The outputs saved every few steps."""
+        output = self.plan.outputs[i]
+        step = lambda j: (j + 1) * output.every
 
-    def _interpolates(self, left: list[Saved], n: Array):
-        """Whether any output left was interpolated in step `n`."""
-        if self.dense is not None:
-            return True
-        inside = [
-            is_within(sub.ts, saved.times, n, self.time(n))
-            for sub, saved in zip(self.saves.subs, left, strict=True)
-            if sub.ts is not None
-        ]
-        return jnp.any(jnp.stack(inside))
+        def pull(at: Position, j: Array):
+            bar = self._row(i, output.row_of_step(step(j)), True)
+            return self._pull_state(i, at.n, at.state, bar)
 
-    def _pull_output(self, at: Position, i: int, index: Array, pred) -> Position:
-        bar = self.saves.bar_at(i, index, pred)
-        return _add(at, self.saves.pull_saved_output(i, at.t, at.state[0], bar))
+        return _Saved(self.trace.n // output.every, step, pull)
 
-    def _unsave_step(self, at: Position, i: int, pred: Array) -> Position:
-        """Pull back the last output if it was saved at the end of this step."""
-        times, outputs = at.left[i]
-        outputs = outputs - jnp.where(pred, 1, 0)
-        at = self._pull_output(at, i, outputs, pred)
-        left = [*at.left[:i], Saved(times, outputs), *at.left[i + 1 :]]
-        return at._replace(left=left)
+    def _row(self, i: int, row: Array, pred) -> PyTree:
+        """The cotangent of one row of an output, or zero."""
+        return jtu.tree_map(lambda x: jnp.where(pred, x[row], 0), self.bars[i])
+
+    def _pull_state(self, i: int, n: Array, state: PyTree, bar: PyTree):
+        """Pull back an output saved at a step, to the parameters and the state."""
+        y, carry = state
+        t = self.plan.steps.time(n)
+
+        def output(moved, y):
+            system, fns = eqx.combine(moved, self.fixed)
+            return eqx.filter(fns[i](t, y, system.args), eqx.is_inexact_array)
+
+        gradient, y_bar = jax.vjp(output, self.moved, y)[1](bar)
+        return gradient, (y_bar, jtu.tree_map(jnp.zeros_like, carry))
+
+    def _pull_time(self, i: int, at: Position, j: Array):
+        """Pull back an output saved between steps, from the start of its step."""
+        plan = self.plan
+        t = plan.outputs[i].ts[j]
+
+        def output(moved, start):
+            parameters = eqx.combine(moved, self.fixed)
+            saved = plan.output(i, parameters, at.n, start, t)
+            return eqx.filter(saved, eqx.is_inexact_array)
+
+        bar = self._row(i, plan.outputs[i].rows_of_times()[j], True)
+        return jax.vjp(output, self.moved, at.state)[1](bar)
+
+    def _pull_all(self, i: int, starts: PyTree):
+        """Pull back all outputs between steps."""
+        plan, output = self.plan, self.plan.outputs[i]
+
+        def outputs(moved, starts):
+            parameters = eqx.combine(moved, self.fixed)
+            saved = plan.all_outputs(i, parameters, starts)
+            return eqx.filter(saved, eqx.is_inexact_array)
+
+        rows = output.rows_of_times()
+        made = jnp.arange(len(rows)) < output.times(self.trace.n)
+
+        def bar(x):
+            keep = made.reshape(-1, *(1,) * (x.ndim - 1))
+            return jnp.where(keep, x[jnp.where(made, rows, 0)], 0)
+
+        bars = jtu.tree_map(bar, self.bars[i])
+        return jax.vjp(outputs, self.moved, starts)[1](bars)
+
+    def _pull_dense(self, at: Position, n: Array, span: Span, start: PyTree):
+        """Pull back the data of dense output, to both ends of a step."""
+
+        def dense_info(moved, start, end):
+            system, _ = eqx.combine(moved, self.fixed)
+            return self.solver.dense_info(system, *span, start, end)
+
+        bar = jtu.tree_map(lambda x: x[n], self.dense)
+        pull = jax.vjp(dense_info, self.moved, start, at.state)[1]
+        more, start_bar, end_bar = pull(bar)
+        return _add(at, (more, end_bar)), start_bar
+
+
+def _materialise(like: PyTree, bar: PyTree) -> PyTree:
+    """The cotangents of all inexact arrays, zero where there are none."""
+    like = eqx.filter(like, eqx.is_inexact_array)
+    return jtu.tree_map(lambda x, b: jnp.zeros_like(x) if b is None else b, like, bar)
 
 
 def _add(at: Position, bars) -> Position:
-    gradient, y_bar = bars
-    y, carry = at.bar
-    gradient = tree_sum(at.gradient, gradient)
-    return at._replace(gradient=gradient, bar=(tree_sum(y, y_bar), carry))
+    gradient, bar = tree_sum((at.gradient, at.bar), bars)
+    return at._replace(gradient=gradient, bar=bar)

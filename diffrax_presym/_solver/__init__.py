@@ -1,6 +1,5 @@
 from ._base import AbstractPresymplecticSolver as AbstractPresymplecticSolver
 from ._checked import Checked as Checked
-from ._collocation import CollocationInterpolation as CollocationInterpolation
 from ._compensated import Compensated as Compensated
 from ._composition import (
     Composition as Composition,

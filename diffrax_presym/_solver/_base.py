@@ -1,4 +1,5 @@
 import abc
+import bisect
 from functools import partial
 from typing import ClassVar, Generic, TYPE_CHECKING, TypeVar
 
@@ -7,8 +8,8 @@ import jax.lax as lax
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
-from .._interpolation import HermiteInterpolation
-from .._misc import tree_scale
+from .._interpolation import HermiteInterpolation, inner_points
+from .._misc import cast_to, tree_scale
 from .._split import State
 from .._system import check_state, System
 from .._term import as_system
@@ -32,6 +33,9 @@ else:
 
 
 _Carry = TypeVar("_Carry")
+
+# Points within a step that dense output uses, from the order up to which they suffice.
+_ORDERS, _INNER_POINTS = (2, 4, 10), (0, 1, 3, 5)
 
 
 class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
@@ -112,6 +116,28 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         check_state(y0)
         return self.start(system, system.time(t0), y0)
 
+    def attempt(
+        self, system: System, t0: Array, t1: Array, y: State, carry: _Carry
+    ) -> tuple[State, _Carry, Result]:
+        """One step, with a failure if its end is invalid."""
+        h = self.step_length(t0, t1)
+        y, carry, result = self.advance(system, t0, t1, h, y, carry)
+        return y, carry, first_failure(result, system.check(t1, y))
+
+    def between(
+        self,
+        system: System,
+        t0: Array,
+        t1: Array,
+        start: tuple[State, _Carry],
+        t: Array,
+    ) -> State:
+        """The state at `t` within the step from `t0` to `t1`, in full order.
+
+        By default a shorter step of the scheme from the start of the step.
+        """
+        return self.advance(system, t0, t, self.step_length(t0, t), *start)[0]
+
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         system = as_system(terms, args)
         t0, t1 = system.time(t0), system.time(t1)
@@ -121,10 +147,8 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         if made_jump is not False and jtu.tree_leaves(carry):
             restart = lambda: self.start(system, t0, y0)
             carry = lax.cond(made_jump, restart, lambda: solver_state)
-        h = self.step_length(t0, t1)
-        y1, new_carry, result = self.advance(system, t0, t1, h, y0, carry)
-        result = first_failure(result, system.check(t1, y1))
-        ends = (y0, carry), (y1, new_carry)
+        y1, new_carry, result = self.attempt(system, t0, t1, y0, carry)
+        h, ends = self.step_length(t0, t1), ((y0, carry), (y1, new_carry))
         dense_info = self.dense_info(system, t0, t1, h, *ends)
         result = dfx.RESULTS.successful if result is None else result
         return y1, None, dense_info, new_carry, result
@@ -143,11 +167,16 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         slope0, slope1 = self.slope(system, t0, *start), self.slope(system, t1, *end)
         info = dict(y0=y0, y1=y1, k0=tree_scale(h, slope0), k1=tree_scale(h, slope1))
         # The order of a scheme does not depend on the term.
-        if self.order(None) > 4:
-            second0 = system.second_derivative(t0, y0, slope0)
-            second1 = system.second_derivative(t1, y1, slope1)
-            info |= dict(b0=tree_scale(h**2, second0), b1=tree_scale(h**2, second1))
-        return info
+        number = _INNER_POINTS[bisect.bisect_left(_ORDERS, self.order(None))]
+        if number == 0:
+            return info
+
+        def at(fraction):
+            t = t0 + fraction * h
+            y = self.between(system, t0, t1, start, t)
+            return y, tree_scale(h, system.slope(t, y))
+
+        return info | dict(inner=lax.map(at, cast_to(inner_points(number), h)))
 
     def func(self, terms, t0, y0, args):
         return terms.vf(t0, y0, args)

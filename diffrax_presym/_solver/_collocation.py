@@ -5,12 +5,7 @@ from collections.abc import Callable
 from decimal import Decimal, localcontext
 from typing import Any, NamedTuple
 
-import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, PyTree
-
-from .._interpolation import AbstractStepInterpolation
-from .._misc import cast_to
 
 
 MAX_STAGES = 8
@@ -32,9 +27,6 @@ class GaussTable(NamedTuple):
     mu: np.ndarray
     # Row k is (2k + 1) P_k(c_j): from slopes times weights to Legendre coefficients.
     project: np.ndarray
-    # From the slopes at 0, the nodes and 1 to the Legendre coefficients of their
-    # polynomial, from that of P_1 on.
-    dense: np.ndarray
 
 
 def legendre(count: int, x: Any) -> list:
@@ -76,40 +68,13 @@ def gauss_table(stages: int) -> GaussTable:
             ),
             stages,
         )
-        at_nodes = [[row[j] * weights[j] for j in range(stages)] for row in project]
         nodes = _round([(1 + x) / 2 for x in points])
         rounded = _round(mu)
         # The larger of two that add up to one is rounded, the other is exact.
         lower = np.tril(rounded, -1)
         upper = np.triu(1 - rounded.T, 1)
         exact = lower + upper + np.eye(stages) / 2
-        dense = _round(_with_ends(at_nodes))
-        return GaussTable(nodes, _round(weights), exact, _round(project), dense)
-
-
-def _with_ends(at_nodes: list[list[Decimal]]) -> list[list[Decimal]]:
-    """The Legendre coefficients of the polynomial through the nodes and both ends.
-
-    To the polynomial p through the nodes it adds
-    P_s ((-1)^s (f_0 - p(0)) (1 - x) + (f_1 - p(1)) x), which is zero at all of them.
-    """
-    stages = len(at_nodes)
-    sign = Decimal((-1) ** stages)
-    zero, one = Decimal(0), Decimal(1)
-    rows = [[zero, *row, zero] for row in at_nodes]
-    columns = range(stages + 2)
-    left = [sum(((-1) ** k * rows[k][j] for k in range(stages)), zero) for j in columns]
-    right = [sum((rows[k][j] for k in range(stages)), zero) for j in columns]
-    left = [sign * ((one if j == 0 else zero) - left[j]) for j in columns]
-    right = [(one if j == stages + 1 else zero) - right[j] for j in columns]
-    even = [(a + b) / 2 for a, b in zip(left, right, strict=True)]
-    odd = [(b - a) / 2 for a, b in zip(left, right, strict=True)]
-    if stages == 1:
-        # The mean is known better than by the slope at the middle.
-        return [even, odd]
-    low, high = (Decimal(n) / (2 * stages + 1) for n in (stages, stages + 1))
-    rows[-1] = [a + low * b for a, b in zip(rows[-1], odd, strict=True)]
-    return [*rows[1:], even, [high * b for b in odd]]
+        return GaussTable(nodes, _round(weights), exact, _round(project))
 
 
 def _guesses(stages: int) -> list[Decimal]:
@@ -132,30 +97,3 @@ def _matrix(entry: Callable, size: int) -> list[list[Decimal]]:
 def _round(x: Any) -> np.ndarray:
     # From decimal to the nearest double.
     return np.vectorize(float, otypes=[float])(np.array(x, dtype=object))
-
-
-class CollocationInterpolation(AbstractStepInterpolation):
-    """The polynomial of a step whose slopes are those of its stages and its two ends.
-
-    Exact at both ends. With s stages, its error between the ends is of order s + 2 in
-    the length of the step; with one stage it is cubic Hermite interpolation.
-    """
-
-    t0: PyTree
-    t1: PyTree
-    y0: PyTree
-    y1: PyTree
-    # Legendre coefficients of the slope, times the length of the step, from P_1 on.
-    slopes: PyTree
-
-    def at_fraction(self, s: Array) -> PyTree:
-        def leaf(y0, y1, slopes):
-            x = cast_to(s, y0)
-            p = legendre(len(slopes) + 2, 2 * x - 1)
-            y = (1 - x) * y0 + x * y1
-            # The integrals of the Legendre polynomials from the start.
-            for k, slope in enumerate(slopes, 1):
-                y = y + (p[k + 1] - p[k - 1]) / (4 * k + 2) * slope
-            return y
-
-        return jtu.tree_map(leaf, self.y0, self.y1, self.slopes)

@@ -62,8 +62,8 @@ class Composition(AbstractComposition):
     """A composition of a symmetric scheme with itself, given by weights.
 
     Order as given. The cost per step is that of the base times the number of weights.
-    Uses Hermite interpolation for dense/ts output, of 3rd order, or of 5th if `order`
-    exceeds 4.
+    Uses Hermite interpolation for dense/ts output, at the cost of up to three more
+    steps.
     """
 
     base: AbstractPresymplecticSolver
@@ -110,8 +110,8 @@ class SuzukiYoshida(AbstractComposition):
     r"""The triple jump of Suzuki and Yoshida, to any even order.
 
     Order as given; $3^{r/2 - 1}$ force evaluations per step at order $r$. Symmetric.
-    Uses Hermite interpolation for dense/ts output, of 3rd order, or of 5th if `order`
-    exceeds 4.
+    Uses Hermite interpolation for dense/ts output, at the cost of up to three more
+    steps.
 
     The scheme of the paper. Its error constants are large, and its stages extend beyond
     both ends of the step, by up to 0.35, 0.65 and 0.92 of its length at orders 4, 6 and
@@ -184,7 +184,7 @@ class PresymplecticYoshida4(AbstractComposition):
     """The fourth-order method of Creutz and Gocksch, Forest and Ruth, Suzuki, Yoshida.
 
     4th order and symmetric. Three force evaluations per step. Uses 3rd order Hermite
-    interpolation for dense/ts output.
+    interpolation for dense/ts output, at the cost of another step.
 
     The fourth-order scheme of the paper, the same as
     [`diffrax_presym.SuzukiYoshida`][]`(4)`; see there for its limitations.
@@ -251,7 +251,8 @@ class Suzuki4(_AbstractTabulated):
     """Suzuki's fourth-order composition of five stages.
 
     4th order, 5 stages, symmetric if its base is: with the default base 5 force
-    evaluations per step. Uses Hermite interpolation for dense/ts output.
+    evaluations per step. Uses Hermite interpolation for dense/ts output, at the cost
+    of another step.
 
     Its error is several times smaller than that of the triple jump
     ([`diffrax_presym.PresymplecticYoshida4`][]) at equal cost, and its stages stay
@@ -271,7 +272,8 @@ class SofroniouSpaletta6(_AbstractTabulated):
     """Sofroniou and Spaletta's sixth-order composition of thirteen stages.
 
     6th order, 13 stages, symmetric if its base is: with the default base 13 force
-    evaluations per step. Uses Hermite interpolation for dense/ts output.
+    evaluations per step. Uses Hermite interpolation for dense/ts output, at the cost
+    of three more steps.
 
     The recommended composition of sixth order, for any base. If the kinetic part has a
     known flow, a [`diffrax_presym.Splitting`][] is more accurate at equal cost.
@@ -303,7 +305,8 @@ class SofroniouSpaletta8(_AbstractTabulated):
     """Sofroniou and Spaletta's eighth-order composition of twenty-one stages.
 
     8th order, 21 stages, symmetric if its base is: with the default base 21 force
-    evaluations per step. Uses Hermite interpolation for dense/ts output.
+    evaluations per step. Uses Hermite interpolation for dense/ts output, at the cost
+    of three more steps.
 
     The recommended composition of eighth order, for any base.
 
@@ -321,7 +324,8 @@ class SofroniouSpaletta10(_AbstractTabulated):
     """Sofroniou and Spaletta's tenth-order composition of thirty-five stages.
 
     10th order, 35 stages, symmetric if its base is: with the default base 35 force
-    evaluations per step. Uses Hermite interpolation for dense/ts output.
+    evaluations per step. Uses Hermite interpolation for dense/ts output, at the cost
+    of three more steps.
 
     For errors close to rounding, which lower orders do not reach with fewer stages.
 

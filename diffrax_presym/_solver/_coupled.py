@@ -63,7 +63,7 @@ class PresymplecticCoupled(AbstractMoveSolver[State]):
     Order 2, 4, 6, 8 or 10 as given; 3, 11, 27, 43 or 71 evaluations of velocity and
     force per step. Explicit for every Hamiltonian, symmetric, and conformally
     symplectic in the doubled phase space. Uses Hermite interpolation for dense/ts
-    output, of 3rd order, or of 5th if `order` exceeds 4, at additional cost.
+    output, at the cost of up to three more steps.
 
     The first choice for Hamiltonians that are neither separable nor split.
     [`diffrax_presym.PresymplecticTao`][] couples the copies within every stage, by a
@@ -138,8 +138,7 @@ class PresymplecticProjected(AbstractPresymplecticSolver[None]):
     Order 2, 4, 6, 8 or 10 as given; 3, 11, 27, 43 or 71 evaluations of velocity and
     force per step. Explicit for every Hamiltonian. Not symmetric, and symplectic up to
     an error of higher order, which matters over very long times. Uses Hermite
-    interpolation for dense/ts output, of 3rd order, or of 5th if `order` exceeds 4, at
-    additional cost.
+    interpolation for dense/ts output, at the cost of up to three more steps.
 
     For Hamiltonians that are neither separable nor split, over moderate times. As
     accurate as [`diffrax_presym.PresymplecticCoupled`][] at the same cost, and without

@@ -1,5 +1,5 @@
 import functools
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -28,7 +28,6 @@ from .._split import State
 from .._system import System
 from ._base import AbstractPresymplecticSolver
 from ._collocation import (
-    CollocationInterpolation,
     gauss_table,
     GaussTable,
     legendre,
@@ -58,8 +57,7 @@ class PresymplecticGauss(AbstractPresymplecticSolver[_Carry]):
     Order 2 to 16, twice the number of stages, and symmetric. Implicit for every
     Hamiltonian: a step takes one evaluation of velocity and force for all stages at
     once, by `jax.vmap`, in each of 3 to 15 iterations. Uses
-    [`diffrax_presym.CollocationInterpolation`][] for dense/ts output, with an error of
-    order `stages + 2` between the steps, at the cost of two more evaluations.
+    Hermite interpolation for dense/ts output, at the cost of up to five more steps.
 
     For Hamiltonians that are neither separable nor split, and for mechanics with a mass
     matrix, [`diffrax_presym.LagrangianSystem`][]. Conformally symplectic to rounding:
@@ -127,7 +125,6 @@ class PresymplecticGauss(AbstractPresymplecticSolver[_Carry]):
     stages: int = eqx.field(static=True)
     root_finder: optx.AbstractRootFinder | None
     max_iterations: int = eqx.field(static=True)
-    interpolation_cls: ClassVar = CollocationInterpolation
 
     def __init__(
         self,
@@ -210,19 +207,6 @@ class PresymplecticGauss(AbstractPresymplecticSolver[_Carry]):
     def _tangent(self):
         return _contract if self.root_finder is None else _factorise
 
-    def dense_info(self, system: System, t0, t1, h, start, end) -> dict[str, PyTree]:
-        (y0, carry0), (y1, carry1) = start, end
-        step = _Step(system, gauss_table(self.stages), t0, h, y0, carry0.lost)
-        # In a gradient by reversal the step was last solved from its end.
-        back = carry1.h * h < 0
-        flip = lambda x0, x1: jnp.where(back, -x0[::-1], x1)
-        slopes = jtu.tree_map(flip, carry0.slopes, carry1.slopes)
-        known = lambda slopes: (slopes, None)
-        slopes, _ = _implicit(step, known, slopes, self._tangent)
-        k0 = tree_scale(h, self.slope(system, t0, y0, carry0))
-        k1 = tree_scale(h, self.slope(system, t1, y1, carry1))
-        return dict(y0=y0, y1=y1, slopes=step.dense(slopes, k0, k1))
-
 
 def _check_number(x, most: int | None, name: str) -> None:
     # `True` is an integer too.
@@ -288,29 +272,6 @@ class _Step:
         if friction is not None:
             p = tree_add(p, 1, friction.decay(self.t0, self.h, self.y[1]))
         return q, p
-
-    def dense(self, slopes: Slopes, k0: State, k1: State) -> PyTree:
-        """The Legendre coefficients of the slope of the mechanical momentum."""
-        friction = self.system.friction
-
-        def one(t, to_middle, weight, stage, slope):
-            (_, p), (velocity, force) = stage, slope
-            velocity, force = tree_scale(1 / weight, (velocity, force))
-            if friction is not None:
-                back = lambda p: self.system.move_frame(self.middle, -to_middle, p)
-                momentum = tree_scale(self.h, back(p))
-                force = friction.net_force(t, back(force), momentum)
-            return velocity, force
-
-        weights = cast_to(self.table.weights, self.h)
-        stages = self.stages(slopes)
-        inner = jax.vmap(one)(self.times, self.to_middle, weights, stages, slopes)
-
-        def leaf(k0, inner, k1):
-            all_slopes = jnp.concatenate([k0[None], inner, k1[None]])
-            return _dot(self.table.dense, all_slopes)
-
-        return jtu.tree_map(leaf, k0, inner, k1)
 
 
 # Up to so many entries a product written out, which XLA fuses with what is around it,

@@ -115,8 +115,8 @@ class Splitting(AbstractSplitting):
     """A splitting into exact drifts and kicks, given by a tableau.
 
     Order as stated by the tableau; one force evaluation per kick, and one less if the
-    step starts with a kick. Uses Hermite interpolation for dense/ts output, of 3rd
-    order, or of 5th if the order of the scheme exceeds 4.
+    step starts with a kick. Uses Hermite interpolation for dense/ts output, at the
+    cost of up to three more steps.
 
     For Hamiltonians whose kinetic part has a known flow, where it is far more accurate
     than a composition at equal cost.
@@ -191,8 +191,8 @@ class Strang(AbstractSplitting):
 class BlanesMoan4(AbstractSplitting):
     """Blanes and Moan's fourth-order splitting S6, for any kinetic energy.
 
-    4th order and symmetric. Six force evaluations per step. Uses 3rd order
-    Hermite interpolation for dense/ts output, at the cost of two more.
+    4th order and symmetric. Six force evaluations per step. Uses Hermite
+    interpolation for dense/ts output, at the cost of another step.
 
     For any Hamiltonian with a kinetic part of known flow, such as a relativistic one.
     If the kinetic energy or the potential is quadratic,
@@ -220,9 +220,8 @@ class BlanesMoan4(AbstractSplitting):
 class BlanesMoan6(AbstractSplitting):
     """Blanes and Moan's sixth-order splitting S10, for any kinetic energy.
 
-    6th order and symmetric. Ten force evaluations per step. Uses 5th order Hermite
-    interpolation for dense/ts output, at the cost of the force and its derivative along
-    the flow at both ends.
+    6th order and symmetric. Ten force evaluations per step. Uses Hermite
+    interpolation for dense/ts output, at the cost of three more steps.
 
     For any Hamiltonian with a kinetic part of known flow. If the kinetic energy or the
     potential is quadratic, [`diffrax_presym.TunedRKN6`][] is more efficient.
@@ -236,8 +235,8 @@ class BlanesMoan6(AbstractSplitting):
 class BlanesMoanRKN4(AbstractSplitting):
     """Blanes and Moan's fourth-order Runge--Kutta--Nyström splitting SRKN 6b.
 
-    4th order and symmetric. Six force evaluations per step. Uses 3rd order Hermite
-    interpolation for dense/ts output, at no cost.
+    4th order and symmetric. Six force evaluations per step. Uses Hermite
+    interpolation for dense/ts output, at the cost of another step.
 
     For quadratic kinetic energies or quadratic potentials: the first choice at moderate
     accuracy.
@@ -251,9 +250,8 @@ class BlanesMoanRKN4(AbstractSplitting):
 class BlanesMoanRKN6(AbstractSplitting):
     """Blanes and Moan's sixth-order Runge--Kutta--Nyström splitting SRKN 14a.
 
-    6th order and symmetric. Fourteen force evaluations per step. Uses 5th order
-    Hermite interpolation for dense/ts output, at the cost of the force and its
-    derivative along the flow at both ends.
+    6th order and symmetric. Fourteen force evaluations per step. Uses Hermite
+    interpolation for dense/ts output, at the cost of three more steps.
 
     For quadratic kinetic energies or quadratic potentials. For oscillations
     [`diffrax_presym.TunedRKN6`][] is more accurate.
@@ -267,9 +265,8 @@ class BlanesMoanRKN6(AbstractSplitting):
 class BlanesCasasRKN8(AbstractSplitting):
     """The eighth-order Runge--Kutta--Nyström splitting of Blanes, Casas et al.
 
-    8th order and symmetric. Nineteen force evaluations per step. Uses 5th order
-    Hermite interpolation for dense/ts output, at the cost of the force and its
-    derivative along the flow at both ends.
+    8th order and symmetric. Nineteen force evaluations per step. Uses Hermite
+    interpolation for dense/ts output, at the cost of three more steps.
 
     For quadratic kinetic energies or quadratic potentials: the first choice for errors
     close to rounding in `float64`.
@@ -296,9 +293,8 @@ class BlanesCasasRKN8(AbstractSplitting):
 class TunedRKN6(AbstractSplitting):
     """A sixth-order Runge--Kutta--Nyström splitting, tuned for oscillations.
 
-    6th order and symmetric. Fourteen force evaluations per step. Uses 5th order Hermite
-    interpolation for dense/ts output, at the cost of two derivatives of the force along
-    the flow.
+    6th order and symmetric. Fourteen force evaluations per step. Uses Hermite
+    interpolation for dense/ts output, at the cost of three more steps.
 
     For quadratic kinetic energies or quadratic potentials: the first choice from six
     digits on. For oscillations about equilibria its error is much smaller than that of
@@ -316,8 +312,8 @@ class TunedLinear8(AbstractSplitting):
     r"""A splitting for linear forces, with steps of half a period or more.
 
     8th order and symmetric for linear forces and constant friction. Fourteen force
-    evaluations per step. Uses 5th order Hermite interpolation for dense/ts output, at
-    the cost of two more and of two of the derivative of the force along the flow.
+    evaluations per step. Uses Hermite interpolation for dense/ts output, at the cost of
+    three more steps.
 
     For forces linear in the positions, by a matrix or a stencil: damped waves, networks
     of springs, quadratic objectives. It allows the longest steps per force evaluation:
