@@ -493,7 +493,7 @@ def test_what_is_not_supported_names_what_is(wrong, what):
 
 def test_schemes_that_cannot_be_reversed_have_another_adjoint():
     projected = dps.PresymplecticProjected()
-    with pytest.raises(ValueError, match="Projected.*FixedStepAdjoint"):
+    with pytest.raises(ValueError, match=r"Projected.*FixedStepAdjoint"):
         solve(INPUTS, REVERSIBLE, projected)
     check(solver=projected, system=nonseparable, adjoints=(FIXED_STEP,))
 

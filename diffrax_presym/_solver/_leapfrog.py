@@ -55,7 +55,9 @@ class PresymplecticLeapfrog(AbstractFrozenSolver[PyTree]):
 
     def moves(self, system: System) -> Moves:
         known = self.first == "momentum" and system.is_separable
-        A, B = self.momentum_first(system, known), self.momentum_first(system).inverse
+        # In both directions the first kick is by the force known from the last one.
+        A = self.momentum_first(system, known)
+        B = A.inverse
         halves = [(0, 0.5, 0.5), (0.5, 1, 0.5)]
         if self.first == "momentum":
             return Stages([A, B], halves)
