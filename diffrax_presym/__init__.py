@@ -74,7 +74,7 @@ from ._split import (
     PotentialSplit as PotentialSplit,
     SharedSplit as SharedSplit,
 )
-from ._step_density import (
+from ._step_size import (
     ArclengthDensity as ArclengthDensity,
     DistanceDensity as DistanceDensity,
     pair_distances as pair_distances,
