@@ -76,6 +76,8 @@ from ._split import (
 )
 from ._step_size import (
     ArclengthDensity as ArclengthDensity,
+    choose_step as choose_step,
+    ChosenStep as ChosenStep,
     DistanceDensity as DistanceDensity,
     pair_distances as pair_distances,
     power_grid as power_grid,

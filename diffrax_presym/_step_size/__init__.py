@@ -1,3 +1,4 @@
+from ._choose import choose_step as choose_step, ChosenStep as ChosenStep
 from ._density import (
     ArclengthDensity as ArclengthDensity,
     DistanceDensity as DistanceDensity,
