@@ -1,10 +1,11 @@
 import numpy as np
 
 
-def intervals(ts: np.ndarray, t0: np.ndarray, t1: np.ndarray, most: int) -> int | None:
+def intervals(ts: np.ndarray, t0: np.ndarray, t1: np.ndarray) -> int | None:
     """The number of equal intervals of the span at whose ends all times lie.
 
-    `None` if there is none up to `most`: the times are irregular.
+    `None` if there is none, or only one that is much finer than the times, as for 0.3
+    and 7.7: the times are irregular.
     """
     start, span = np.float64(t0), np.float64(t1) - np.float64(t0)
     where = np.sort((np.asarray(ts, float) - start) / span)
@@ -19,7 +20,7 @@ def intervals(ts: np.ndarray, t0: np.ndarray, t1: np.ndarray, most: int) -> int 
     # its points.
     for multiple in (1, 2, 3, 4):
         number = round(multiple / shortest)
-        if number > most:
+        if number > 4 * (ts.size + 1):
             return None
         tolerance = rounding * number
         at = where * number
