@@ -81,9 +81,9 @@ def test_the_error_is_that_of_the_solve(result):
 def test_evaluations(result):
     for run in result.runs:
         per_step = run.evaluations / run.steps
-        # Per step of the solve, and for output between steps.
+        # Per step of the solve and, for ours, per saved time.
         least, most = {
-            "tuned": (14, 19),
+            "tuned": (14, 14 * (1 + len(TS) / run.steps) + 1),
             "Tsit5": (6, 6.1),
             "Tsit5, adaptive": (6, 6.5),
         }[run.solver]
@@ -123,11 +123,11 @@ def test_without_matplotlib(result, monkeypatch):
 def test_solvers_that_are_left_out(capsys):
     result = work_precision(
         *(MIXED, 1.0, 0.0, Y0),
-        rtol=1e-6,
+        rtol=1e-5,
         solvers={
             "copies": dps.PresymplecticCoupled(4),
             "splitting": dps.TunedRKN6(),
-            "first order": dps.PresymplecticTao(),
+            "low order": dps.PresymplecticTao(),
         },
         decades=0,
         repeats=1,
@@ -135,7 +135,7 @@ def test_solvers_that_are_left_out(capsys):
     )
     assert result.fastest == "copies"
     assert "PresymplecticCoupled" in result.left_out["splitting"]
-    assert "more than 500 steps" in result.left_out["first order at 1e-06"]
+    assert "more than 500 steps" in result.left_out["low order at 1e-05"]
     assert "not measured: splitting" in capsys.readouterr().out
 
 
@@ -155,9 +155,15 @@ def test_the_solvers_by_default(term, known):
         ({"term": dfx.ODETerm(lambda t, y, args: y)}, ValueError, "HamiltonianTerm"),
         ({"rtol": 0.0}, ValueError, "must be positive, but got 0.0"),
         ({"ts": jnp.array([3.0, 2.0])}, ValueError, "work_precision.* must be sorted"),
-        ({"rtol": 1e-15}, RuntimeError, "no reference solution"),
-        ({"rtol": 1e-9, "max_steps": 40}, RuntimeError, "No solver reaches"),
-        ({"solvers": {"rkn": dps.TunedRKN6()}}, RuntimeError, "rkn: .*Coupled"),
+        pytest.param(
+            *({"rtol": 1e-15}, RuntimeError, "no reference solution"),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            *({"rtol": 1e-9, "max_steps": 40}, RuntimeError, "No solver reaches"),
+            marks=pytest.mark.slow,
+        ),
+        ({"solvers": {"rkn": dps.TunedRKN6()}}, ValueError, "rkn: .*Coupled"),
     ],
 )
 def test_bad_input(changes, error, message):

@@ -27,8 +27,8 @@ class ChosenStep(NamedTuple):
     - `on_grid`: whether the step divides the spacing of `ts`, or is a multiple of it.
     - `trials`: the numbers of steps that were tried, and the errors found.
 
-    A measured order well below that of the scheme means that errors are dominated by
-    the interpolation between steps, or that the force is not smooth.
+    A measured order well below that of the scheme means that the force is not smooth,
+    or for a solver of Diffrax that its interpolation between steps is less accurate.
     """
 
     dt0: float
@@ -94,12 +94,11 @@ def choose_step(
 
         ```python
         ts = jnp.linspace(0, 100, 201)
-        step = choose_step(
-            term, TunedRKN6(), 0.0, 100.0, y0, rtol=1e-6, atol=1e-6, ts=ts
-        )
+        problem, adjoint = (term, TunedRKN6(), 0.0, 100.0), FixedStepAdjoint()
+        step = choose_step(*problem, y0, rtol=1e-6, atol=1e-6, ts=ts, adjoint=adjoint)
         sol = diffeqsolve(
-            term, TunedRKN6(), 0.0, 100.0, step.dt0, y0,
-            saveat=SaveAt(ts=ts), max_steps=step.steps,
+            *problem, step.dt0, y0, saveat=SaveAt(ts=ts), adjoint=adjoint,
+            max_steps=step.steps,
         )
         ```
 
@@ -114,8 +113,9 @@ def choose_step(
         Defaults to `None`, for `t1` alone.
     - `max_steps`: the largest number of steps of a trial solve. That is about four
         times the number of steps that can be chosen.
-    - `adjoint`: the `adjoint` of the solve, if solutions between steps depend on it.
-        Defaults to that of Diffrax.
+    - `adjoint`: the `adjoint` of the solve, on which solutions between steps may
+        depend, such as [`diffrax_presym.FixedStepAdjoint`][]. Defaults to that of
+        Diffrax.
 
     **Returns:**
 

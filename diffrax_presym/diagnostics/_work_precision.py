@@ -11,7 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
+from .._adjoint import FixedStepAdjoint
 from .._solver import (
+    AbstractPresymplecticSolver,
     BlanesCasasRKN8,
     BlanesMoan4,
     BlanesMoan6,
@@ -52,8 +54,8 @@ NONSEPARABLE = {
 }
 DIFFRAX = {"Tsit5": dfx.Tsit5(), "Dopri8": dfx.Dopri8()}
 
-# Evaluations are counted over at most this many steps, and scaled.
-COUNTED_STEPS = 200
+# Evaluations of more constant steps than these are extrapolated.
+COUNTED_STEPS = 1000
 
 
 class WorkPrecisionRun(NamedTuple):
@@ -169,6 +171,7 @@ def work_precision(
     Diffrax's also with an adaptive step, whose tolerance is varied until the error of
     the solution fits. Errors are measured against `diffrax.Dopri8` with a much smaller
     tolerance and steps that end at each saved time, which `diffrax.Tsit5` must confirm.
+    Solvers of this package use the loop of [`diffrax_presym.FixedStepAdjoint`][].
 
     A time is the median over rounds in which all solvers take turns, compiled and
     warmed up. It is that of this machine, which should not be busy otherwise. The
@@ -206,7 +209,8 @@ def work_precision(
 
     **Raises:**
 
-    `ValueError` if an argument is not valid. `RuntimeError` if no reference solution is
+    `ValueError` if an argument is not valid, or no solver accepts the problem.
+    `RuntimeError` if no reference solution is
     found to this precision, or no solver reaches the tolerance.
     """
     if not isinstance(term, HamiltonianTerm):
@@ -223,10 +227,13 @@ def work_precision(
     ts = np.asarray([t1], t1.dtype) if ts is None else ts
     problem = Problem(term, t0, t1, y0, args, ts, rtol, rtol if atol is None else atol)
     levels = [10.0**k for k in range(decades, -decades - 1, -1)]
-    exact = _reference(problem, levels[-1], max_steps)
-
     left_out: dict[str, str] = {}
     methods = _methods(problem, solvers, left_out)
+    reasons = lambda: "; ".join(f"{name}: {why}" for name, why in left_out.items())
+    if not methods:
+        raise ValueError(f"No solver accepts this problem. {reasons()}")
+    exact = _reference(problem, levels[-1])
+
     points: dict[tuple[str, float], tuple[Method, Any, Solution]] = {}
     for method in methods:
         for level in levels:
@@ -237,8 +244,7 @@ def work_precision(
                 continue
             points[method.name, level] = method, x, method.solve(x)
     if not any(level == 1 for _, level in points):
-        reasons = "; ".join(f"{name}: {why}" for name, why in left_out.items())
-        raise RuntimeError(f"No solver reaches {rtol=} within `max_steps`. {reasons}")
+        raise RuntimeError(f"No solver reaches {rtol=} within `max_steps`. {reasons()}")
 
     calls = {key: method.call(x) for key, (method, x, _) in points.items()}
     seconds = _interleaved(calls, repeats)
@@ -268,12 +274,16 @@ class Problem(NamedTuple):
     rtol: float
     atol: float
 
-    def solve(self, term, solver, dt0, controller, max_steps: int | None = None):
+    def solve(self, term, solver, dt0, controller):
+        known = isinstance(solver, AbstractPresymplecticSolver)
+        known = known and isinstance(controller, dfx.ConstantStepSize)
         return dfx.diffeqsolve(
             *(term, solver, self.t0, self.t1, dt0, self.y0, self.args),
             saveat=dfx.SaveAt(ts=jnp.asarray(self.ts)),
             stepsize_controller=controller,
-            max_steps=max_steps,
+            # The loop that is recommended for this solver.
+            adjoint=FixedStepAdjoint() if known else dfx.RecursiveCheckpointAdjoint(),
+            max_steps=None,
             throw=False,
         )
 
@@ -294,7 +304,7 @@ class Method:
         self.name = f"{name}, adaptive" if adaptive else name
         self._run = self._compiled(problem.term)
 
-    def _compiled(self, term, max_steps=None) -> Callable:
+    def _compiled(self, term) -> Callable:
         problem, span = self.problem, self.problem.t1 - self.problem.t0
         arrays, static = eqx.partition((problem, term, self.solver), eqx.is_array)
 
@@ -305,7 +315,7 @@ class Method:
                 controller, dt0 = problem.controller(x), None
             else:
                 controller, dt0 = dfx.ConstantStepSize(), span / x
-            sol = problem.solve(term, solver, dt0, controller, max_steps)
+            sol = problem.solve(term, solver, dt0, controller)
             done = sol.result == dfx.RESULTS.successful
             return sol.ys, done, sol.stats["num_steps"]
 
@@ -315,7 +325,7 @@ class Method:
     def _counting(self) -> tuple[Counter, Callable]:
         counter = Counter()
         hamiltonian = counted(self.problem.term.hamiltonian, counter)
-        return counter, self._compiled(HamiltonianTerm(hamiltonian), COUNTED_STEPS)
+        return counter, self._compiled(HamiltonianTerm(hamiltonian))
 
     def call(self, x) -> Callable:
         """The compiled solve as a function without arguments."""
@@ -357,13 +367,18 @@ class Method:
         return best
 
     def evaluations(self, x, steps: int) -> int:
-        """The number of force evaluations, from that of the first steps."""
+        """The number of force evaluations."""
+        if self.adaptive or steps <= COUNTED_STEPS:
+            return self._count(x)
+        few, many = self._count(COUNTED_STEPS // 2), self._count(COUNTED_STEPS)
+        per_step = (many - few) / (COUNTED_STEPS - COUNTED_STEPS // 2)
+        return round(many + per_step * (steps - COUNTED_STEPS))
+
+    def _count(self, x) -> int:
         counter, run = self._counting
         counter.count = 0
-        *_, counted_steps = jax.block_until_ready(
-            run(jnp.asarray(x, self.problem.t0.dtype))
-        )
-        return round(counter.count * steps / int(counted_steps))
+        jax.block_until_ready(run(jnp.asarray(x, self.problem.t0.dtype)))
+        return counter.count
 
 
 def _methods(problem: Problem, solvers, left_out: dict[str, str]) -> list[Method]:
@@ -403,7 +418,7 @@ def _methods(problem: Problem, solvers, left_out: dict[str, str]) -> list[Method
     return methods
 
 
-def _reference(problem: Problem, level: float, max_steps: int) -> Solution:
+def _reference(problem: Problem, level: float) -> Solution:
     """A solution with an error far below the level, confirmed by another solver."""
 
     @eqx.filter_jit
