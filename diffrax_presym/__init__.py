@@ -74,8 +74,10 @@ from ._split import (
     PotentialSplit as PotentialSplit,
     SharedSplit as SharedSplit,
 )
-from ._step_density import (
+from ._step_size import (
     ArclengthDensity as ArclengthDensity,
+    choose_step as choose_step,
+    ChosenStep as ChosenStep,
     DistanceDensity as DistanceDensity,
     pair_distances as pair_distances,
     power_grid as power_grid,

@@ -44,6 +44,7 @@ SLOW = re.compile(
             r"test_diffeqsolve.*any_pytrees\[leapfrog_BA",
             r"test_hard_cases.*(ensemble_of_chaos|no_overflow_of_the_frame)",
             r"test_step_density.*can_be_continued",
+            r"test_choose_step.*(is_reached\[(irregular|orbit)|twice_as_many)",
         ]
     )
 )

@@ -258,13 +258,15 @@ def test_nystroem_splittings_need_a_quadratic_kinetic_energy(solver, hamiltonian
 
 
 @pytest.mark.parametrize("solver", [LEAPFROG, dps.PresymplecticTao()])
-def test_step_sizes_by_error_estimate(solver):
-    # The message is Diffrax's and cannot be changed by the solver.
-    controller = dfx.PIDController(rtol=1e-3, atol=1e-3)
-    with pytest.raises(RuntimeError, match="solver that does not provide error est"):
+@pytest.mark.parametrize("options", [{}, {"step_ts": jnp.array([0.5])}], ids=str)
+def test_step_sizes_by_error_estimate(solver, options):
+    controller = dfx.PIDController(rtol=1e-3, atol=1e-3, **options)
+    with pytest.raises(ValueError) as error:
         trace(TERM, solver, stepsize_controller=controller)
-    # The alternative is described in the documentation of the solvers.
-    assert "`diffrax.HalfSolver`" in str(dps.AbstractPresymplecticSolver.__doc__)
+    Mistake(
+        "have no error estimate", "which the step size controller needs", "`dt0=choose_"
+    ).check(error)
+    assert "`diffrax.HalfSolver(solver)`" in str(error.value)
     trace(TERM, dfx.HalfSolver(solver), stepsize_controller=controller)
 
 

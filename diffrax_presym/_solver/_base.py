@@ -23,6 +23,7 @@ from ._engine import (
     Span,
     Stage,
 )
+from ._estimate import no_error_estimate
 
 
 if TYPE_CHECKING:
@@ -43,7 +44,8 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
 
     A scheme defines its initial solver state and its step; `diffrax.diffeqsolve`
     handles saving, events, adjoints and the direction of time. No scheme has an error
-    estimate: for adaptive steps, wrap it in `diffrax.HalfSolver`.
+    estimate: [`diffrax_presym.choose_step`][] finds the step for a tolerance. For
+    adaptive steps, wrap the scheme in `diffrax.HalfSolver`.
     """
 
     # Not `HamiltonianTerm`, so that other terms reach the error message of `as_system`.
@@ -151,7 +153,7 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         h, ends = self.step_length(t0, t1), ((y0, carry), (y1, new_carry))
         dense_info = self.dense_info(system, t0, t1, h, *ends)
         result = dfx.RESULTS.successful if result is None else result
-        return y1, None, dense_info, new_carry, result
+        return y1, no_error_estimate(y1), dense_info, new_carry, result
 
     def dense_info(
         self,

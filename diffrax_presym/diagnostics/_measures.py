@@ -9,9 +9,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Inexact, PyTree
 
-from ._misc import as_time, tree_dot
-from ._split import State
-from ._term import HamiltonianTerm
+from .._misc import as_time, tree_dot
+from .._split import State
+from .._term import HamiltonianTerm
 
 
 Times = Inexact[Array, " times"]

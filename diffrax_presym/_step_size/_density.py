@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
-from ._misc import as_parameter, as_positive, cast_to, describe, tree_dot
-from ._term import HamiltonianTerm
+from .._misc import as_parameter, as_positive, cast_to, describe, tree_dot
+from .._term import HamiltonianTerm
 
 
 Scalar = Inexact[Array, ""]

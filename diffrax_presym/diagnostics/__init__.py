@@ -1,0 +1,15 @@
+"""Measures of solutions and solvers: energy, structure, order, error against time."""
+
+from ._measures import (
+    canonical_energy as canonical_energy,
+    convergence_order as convergence_order,
+    copy_distance as copy_distance,
+    energy as energy,
+    energy_error as energy_error,
+    structure_defect as structure_defect,
+)
+from ._work_precision import (
+    work_precision as work_precision,
+    WorkPrecision as WorkPrecision,
+    WorkPrecisionRun as WorkPrecisionRun,
+)
