@@ -20,6 +20,7 @@ from jaxtyping import Array, PyTree
 
 from ._misc import cast_to
 from ._scan import equations
+from ._solver._engine import Span
 from ._system import System
 
 
@@ -37,7 +38,7 @@ class Steps:
         self.t0, self.t1, self.dt0 = t0, t1, dt0
         self.ts = controller.ts if isinstance(controller, dfx.StepTo) else None
         if self.ts is not None:
-            self.total = jnp.asarray(len(self.ts) - 1)
+            self.unequal = self.total = jnp.asarray(len(self.ts) - 1)
             return
         up, down = (jnp.asarray(sign * jnp.inf, t0.dtype) for sign in (1, -1))
         self.steps = jnp.ceil((t1 - t0) / jnp.nextafter(dt0, up))
@@ -46,6 +47,10 @@ class Steps:
             self.almost = jnp.nextafter(self.almost, down)
         # Fewer than `steps` where these are so short that the last are made one.
         self.total = self._after((self.almost - t0) / self._span * self.steps, t1)
+        # All other steps have the same length; their ends are rounded.
+        several = self.total == self.steps.astype(int)
+        self.unequal = jnp.where(several, jnp.minimum(2, self.total), self.total)
+        self.length = (t1 - t0) / self.steps
 
     def time(self, n: Array) -> Array:
         """The start of step `n`."""
@@ -151,6 +156,22 @@ class Plan:
         ]
         self.at_once = self._evaluates_at_once()
 
+    @property
+    def length(self) -> Array:
+        """The length of the steps of equal length, in physical time."""
+        zero, length = (
+            self.system.time(x) for x in (0 * self.steps.t0, self.steps.length)
+        )
+        return self.solver.step_length(zero, length)
+
+    def span(self, n: Array) -> Span:
+        """Step `n`, in physical time."""
+        t0, t1 = (self.system.time(self.steps.time(i)) for i in (n, n + 1))
+        h = self.solver.step_length(t0, t1)
+        if self.steps.ts is None:
+            h = jnp.where(n < self.steps.unequal, h, self.length)
+        return Span(t0, t1, h)
+
     def between(self, system: System, n: Array, start: PyTree, t: Array) -> PyTree:
         """The state at a time in step `n`, from that at the start of the step."""
         begin, end = self.steps.time(n), self.steps.time(n + 1)
@@ -202,7 +223,6 @@ class Now(NamedTuple):
     """How far a solve has come."""
 
     n: Array
-    t: Array
     state: tuple[PyTree, PyTree]
     result: dfx.RESULTS | None  # `None` if no step can fail
     meter: PyTree
@@ -234,6 +254,7 @@ class _Every(NamedTuple):
     """What an output saves every few steps, in its final rows."""
 
     output: Output
+    time: Callable[[Array], Array]
     args: PyTree
     rows: PyTree
 
@@ -245,7 +266,7 @@ class _Every(NamedTuple):
         return (now.n // every + 1) * every
 
     def save(self, now: Now, state, hit):
-        value = self.output.fn(now.t, now.state[0], self.args)
+        value = self.output.fn(self.time(now.n), now.state[0], self.args)
         return _set(state, self.output.row_of_step(now.n), value, hit)
 
 
@@ -283,7 +304,7 @@ def run(inputs: Inputs, keep: Callable[[Plan], Array] | None = None):
             stack = _Stack(output.held, value, first())
         stacks.append(stack)
     every = [
-        _Every(output, args, ys) if output.every else None
+        _Every(output, plan.steps.time, args, ys) if output.every else None
         for output, ys in zip(plan.outputs, rows, strict=True)
     ]
     kept = None if keep is None else _Stack(keep(plan), of_state, plan.start)
@@ -298,7 +319,7 @@ def run(inputs: Inputs, keep: Callable[[Plan], Array] | None = None):
             values = plan.all_outputs(i, inputs.parameters, starts[i])
         elif stacked[i] is not None:
             values, _ = stacked[i]
-        final = partial(fns[i], now.t, now.state[0], args)
+        final = partial(fns[i], plan.steps.time(now.n), now.state[0], args)
         states.append(_assemble(plan, output, save, now, ys, values, final))
     return _final_state(plan, now, plan.structure.unflatten(states)), trace
 
@@ -308,28 +329,29 @@ def _walk(plan: Plan, records: PyTree) -> tuple[Now, PyTree]:
     steps, solver, system = plan.steps, plan.solver, plan.system
     init, meter = plan.rest["init_state"], plan.rest["progress_meter"]
 
-    def step(now: Now) -> Now:
-        t = steps.time(now.n + 1)
-        t0, t1 = system.time(now.t), system.time(t)
-        y, carry, result = solver.attempt(system, t0, t1, *now.state)
+    def step(equal: bool, now: Now) -> Now:
+        span = plan.span(now.n)
+        if equal:
+            # What depends on the length alone is computed before the loop.
+            span = span._replace(h=plan.length)
+        y, carry, result = solver.attempt(system, *span, *now.state)
         end, infos = (y, carry), now.dense
         if infos is not None:
-            h = solver.step_length(t0, t1)
-            info = solver.dense_info(system, t0, t1, h, now.state, end)
+            info = solver.dense_info(system, *span, now.state, end)
             infos = _set(infos, now.n, info, True)
-        fraction = (t - steps.t0) / (steps.t1 - steps.t0)
-        return Now(now.n + 1, t, end, result, meter.step(now.meter, fraction), infos)
+        done = (steps.time(now.n + 1) - steps.t0) / (steps.t1 - steps.t0)
+        return Now(now.n + 1, end, result, meter.step(now.meter, done), infos)
 
-    zero = jnp.asarray(0)
-    meters = init.progress_meter_state
-    now = Now(zero, steps.t0, plan.start, None, meters, init.dense_infos)
-    can_fail = eqx.filter_eval_shape(step, now).result is not None
+    zero, meters = jnp.asarray(0), init.progress_meter_state
+    now = Now(zero, plan.start, None, meters, init.dense_infos)
+    can_fail = eqx.filter_eval_shape(partial(step, False), now).result is not None
     if can_fail:
         now = now._replace(result=jtu.tree_map(jnp.asarray, dfx.RESULTS.successful))
     going = lambda now: not can_fail or (now.result == dfx.RESULTS.successful)
 
-    def advance(stop: Array, now: Now) -> Now:
-        return lax.while_loop(lambda now: (now.n < stop) & going(now), step, now)
+    def advance(equal: bool, stop: Array, now: Now) -> Now:
+        more = lambda now: (now.n < stop) & going(now)
+        return lax.while_loop(more, partial(step, equal), now)
 
     is_record = lambda x: isinstance(x, _Stack | _Every)
     flat, structure = jtu.tree_flatten(records, is_leaf=is_record)
@@ -343,24 +365,30 @@ def _walk(plan: Plan, records: PyTree) -> tuple[Now, PyTree]:
         pairs = zip(flat, states, strict=True)
         return [record.next(now, state, never) for record, state in pairs]
 
-    def stop(x):
+    def stop(equal: bool, x):
         now, states = x
         wanted = due(now, states)
         at = reduce(jnp.minimum, wanted)
-        now = step(now) if each else advance(at, now)
+        now = step(equal, now) if each else advance(equal, at, now)
         new = [
             record.save(now, state, alone or (w == at) & (now.n == at))
             for record, state, w in zip(flat, states, wanted, strict=True)
         ]
         return now, new
 
-    def more(x):
+    def more(last: Array, x):
         now, states = x
-        return (reduce(jnp.minimum, due(now, states)) <= plan.last) & going(now)
+        return (reduce(jnp.minimum, due(now, states)) <= last) & going(now)
 
-    if flat:
-        now, states = lax.while_loop(more, stop, (now, states))
-    now = advance(plan.last, now)
+    def run(equal: bool, last: Array, now: Now, states):
+        if flat:
+            both = partial(more, last), partial(stop, equal)
+            now, states = lax.while_loop(*both, (now, states))
+        return advance(equal, last, now), states
+
+    now, states = run(False, jnp.minimum(steps.unequal, plan.last), now, states)
+    if steps.ts is None:
+        now, states = run(True, plan.last, now, states)
     return now, jtu.tree_unflatten(structure, states)
 
 
@@ -380,7 +408,7 @@ def _assemble(plan: Plan, output: Output, save, now: Now, ys, values, final: Cal
     saved = output.saved(n)
     if output.t1:
         separate = output.end_is_separate(n)
-        ts = _set(ts, saved, now.t, separate)
+        ts = _set(ts, saved, steps.time(n), separate)
         ys = _set(ys, saved, final(), separate)
         saved = saved + 1
     return eqx.tree_at(
@@ -409,7 +437,7 @@ def _final_state(plan: Plan, now: Now, save_state):
         state.save_state,
         state.progress_meter_state,
     )
-    new = (*now.state, now.t, n, n, result, save_state, now.meter)
+    new = (*now.state, plan.steps.time(n), n, n, result, save_state, now.meter)
     state = eqx.tree_at(get, init, new, is_leaf=lambda x: x is None)
     # The first of its numbers counts the steps.
     count, *rest = jtu.tree_leaves(init.controller_state)

@@ -145,8 +145,8 @@ def test_a_solve_that_fails():
 
     ours, theirs = run(OURS[0]), run(DIFFRAX)
     assert ours.result == theirs.result != dfx.RESULTS.successful
-    assert 0 < jnp.sum(jnp.isfinite(theirs.ts)) < 10
-    np.testing.assert_array_equal(ours.ts, theirs.ts)
+    assert 0 < jnp.sum(jnp.isfinite(theirs.ts)) < 20
+    np.testing.assert_allclose(ours.ts, theirs.ts, rtol=1e-15)
 
 
 @pytest.mark.parametrize(

@@ -54,14 +54,9 @@ class Backward:
             )
         ]
 
-    def span(self, n: Array) -> Span:
-        """The span of step `n`, in physical time."""
-        t0, t1 = (self.system.time(self.plan.steps.time(i)) for i in (n, n + 1))
-        return Span(t0, t1, self.solver.step_length(t0, t1))
-
     def advance(self, n: Array, state: PyTree) -> PyTree:
         """The state after step `n`."""
-        return self.solver.advance(self.system, *self.span(n), *state)[:2]
+        return self.solver.advance(self.system, *self.plan.span(n), *state)[:2]
 
     def end(self) -> Position:
         """The end of the solve, where also outputs between steps are pulled back to
@@ -139,7 +134,7 @@ class Backward:
     def step(self, at: Position, start: Any = None) -> Position:
         """One step back; `start` is the state at its start, if known."""
         n, system = at.n - 1, self.system
-        span, moves = self.span(n), self.solver.moves(system)
+        span, moves = self.plan.span(n), self.solver.moves(system)
         if self.dense is None:
             start_bar = jtu.tree_map(jnp.zeros_like, at.bar)
         else:

@@ -119,10 +119,9 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         return self.start(system, system.time(t0), y0)
 
     def attempt(
-        self, system: System, t0: Array, t1: Array, y: State, carry: _Carry
+        self, system: System, t0: Array, t1: Array, h: Array, y: State, carry: _Carry
     ) -> tuple[State, _Carry, Result]:
         """One step, with a failure if its end is invalid."""
-        h = self.step_length(t0, t1)
         y, carry, result = self.advance(system, t0, t1, h, y, carry)
         return y, carry, first_failure(result, system.check(t1, y))
 
@@ -149,8 +148,9 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         if made_jump is not False and jtu.tree_leaves(carry):
             restart = lambda: self.start(system, t0, y0)
             carry = lax.cond(made_jump, restart, lambda: solver_state)
-        y1, new_carry, result = self.attempt(system, t0, t1, y0, carry)
-        h, ends = self.step_length(t0, t1), ((y0, carry), (y1, new_carry))
+        h = self.step_length(t0, t1)
+        y1, new_carry, result = self.attempt(system, t0, t1, h, y0, carry)
+        ends = (y0, carry), (y1, new_carry)
         dense_info = self.dense_info(system, t0, t1, h, *ends)
         result = dfx.RESULTS.successful if result is None else result
         return y1, no_error_estimate(y1), dense_info, new_carry, result
