@@ -91,12 +91,17 @@ class Output:
         self.fn, self.first, self.every = fn, int(sub.t0), sub.steps
         self.t1 = sub.t1 and sub.steps != 1
         self.ts: Array = jnp.zeros(0) if sub.ts is None else sub.ts
-        self.held, self.empty = jnp.zeros(0, int), steps.total == 0
+        self.held = self.start = jnp.zeros(0, int)
+        self.empty = steps.total == 0
         if sub.ts is not None:
-            # The step that each time is in. Steps that are not made are after all
-            # others.
+            # The step that each time is in, and the one from whose start it is
+            # computed: the next one if that starts at this time. Steps that are not
+            # made are after all others.
             step = steps.holding(sub.ts)
-            self.held = jnp.where(step < last, step, last + 1)
+            after = jnp.where(steps.time(step + 1) == sub.ts, step + 1, step)
+            made = step < last
+            self.held = jnp.where(made, step, last + 1)
+            self.start = jnp.where(made, after, last + 1)
 
     def times(self, n: Array) -> Array:
         """The number of times of `ts` saved in the first `n` steps."""
@@ -154,6 +159,7 @@ class Plan:
             Output(sub, fn, self.steps, self.last)
             for sub, fn in zip(subs, fns, strict=True)
         ]
+        self.at_once = False
         self.at_once = self._evaluates_at_once()
 
     @property
@@ -181,8 +187,10 @@ class Plan:
         at_start = t <= begin
         times = begin, end, jnp.where(at_start, end, t)
         t0, t1, t = (system.time(x) for x in times)
-        y = self.solver.between(system, t0, t1, start, t)
-        return jtu.tree_map(partial(jnp.where, at_start), start[0], y)
+        shorter = lambda: self.solver.between(system, t0, t1, start, t)
+        if self.at_once:
+            return jtu.tree_map(partial(jnp.where, at_start), start[0], shorter())
+        return lax.cond(at_start, lambda: start[0], shorter)
 
     def output(self, i: int, parameters, n: Array, start: PyTree, t: Array) -> PyTree:
         """What is saved at a time in step `n`."""
@@ -195,10 +203,10 @@ class Plan:
         # Steps that are not made are replaced by the start of the solve, where nothing
         # fails.
         output = self.outputs[i]
-        made = output.held <= self.last
-        held = jnp.where(made, output.held, 0)
+        made = output.start <= self.last
+        steps = jnp.where(made, output.start, 0)
         ts = jnp.where(made, output.ts, self.steps.t0)
-        return jax.vmap(partial(self.output, i, parameters))(held, starts, ts)
+        return jax.vmap(partial(self.output, i, parameters))(steps, starts, ts)
 
     def _evaluates_at_once(self) -> bool:
         """Whether outputs between steps are computed at once after the last step."""
@@ -296,12 +304,12 @@ def run(inputs: Inputs, keep: Callable[[Plan], Array] | None = None):
         rows.append(_set(save.ys, 0, first(), True) if output.first else save.ys)
         stack = None
         if len(output.held) and plan.at_once:
-            stack = _Stack(output.held, of_state, plan.start)
+            stack = _Stack(output.start, of_state, plan.start)
         elif len(output.held):
             value = lambda j, now, i=i, output=output: plan.output(
                 i, inputs.parameters, now.n, now.state, output.ts[j]
             )
-            stack = _Stack(output.held, value, first())
+            stack = _Stack(output.start, value, first())
         stacks.append(stack)
     every = [
         _Every(output, plan.steps.time, args, ys) if output.every else None

@@ -82,8 +82,8 @@ class Backward:
                         zeros(self.moved),
                         jtu.tree_map(lambda x: x[j], rows),
                     )
-                held = jnp.where(output.empty, 0, output.held)
-                step = lambda j, held=held: held[j]
+                begin = jnp.where(output.empty, 0, output.start)
+                step = lambda j, begin=begin: begin[j]
                 self.saved.append(_Saved(output.times(n), step, pull))
         return Position(n, state, bar, gradient, [x.number for x in self.saved])
 
