@@ -260,6 +260,7 @@ def _search(
     steepest: float,
 ) -> Trial:
     """A smaller number of steps than `high` that reaches the tolerance."""
+    failed = False
     for _ in range(6):
         numbers = between(low.steps, high.steps)
         if high.error >= ENOUGH or not numbers.size:
@@ -271,7 +272,10 @@ def _search(
             slope = math.log(low.error / error) / math.log(high.steps / low.steps)
             slope = min(slope, steepest)
         guess = high.steps * (error / AIM) ** (1 / slope)
+        if failed:  # Not again close to the lower end.
+            guess = max(guess, math.sqrt(low.steps * high.steps))
         n = int(numbers[np.argmin(np.abs(numbers - guess))])
         trial = Trial(n, measure(n))
-        low, high = (low, trial) if trial.error <= 1 else (trial, high)
+        failed = trial.error > 1
+        low, high = (trial, high) if failed else (low, trial)
     return high
