@@ -150,12 +150,12 @@ def measure(problem, ts, exact, table, ratios):
 def summary(ratios, label):
     got, predicted = map(np.array, zip(*ratios, strict=True))
     within = lambda x, factor: np.mean((x >= 1 / factor) & (x <= factor))
+    mean = statistics.geometric_mean(got)
     print(
-        f"\n{label}: got within a factor of three of the tolerance "
-        f"{within(got, 3):.0%}, of the prediction {within(predicted, 3):.0%}; "
-        f"got over the tolerance at most {np.max(got):.2f}, "
-        f"geometric mean "
-        f"{statistics.geometric_mean(got):.2f}"
+        f"\n{label}, error got over tolerance: mean {mean:.2f}, largest "
+        f"{np.max(got):.2f}, within a factor of three {within(got, 3):.0%}"
+        f"\nerror got over predicted: {np.min(predicted):.2f} to "
+        f"{np.max(predicted):.2f}"
     )
 
 
