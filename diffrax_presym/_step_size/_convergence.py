@@ -185,7 +185,8 @@ class Convergence:
             np.max(np.abs(np.asarray(a, float) - b)) / c
             for a, b, c in zip(coarse.leaves, fine.leaves, largest, strict=True)
         )
-        if self._regular and self._stalls >= 2 and change < eps**0.25:
+        rounding = change < 1e3 * eps or (self._regular and change < eps**0.25)
+        if self._stalls >= 2 and rounding:
             precision = fine.leaves[0].dtype
             more = (
                 ""
