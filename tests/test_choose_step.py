@@ -39,6 +39,11 @@ def term_of(potential, damping=0.1):
 
 
 PENDULUM = term_of(cosine)
+SPRING = dps.HamiltonianTerm(
+    dps.SeparableHamiltonian(
+        dps.QuadraticKinetic(), lambda t, q, args: jnp.sum(q**2) / 2
+    )
+)
 Y0 = jnp.array([2.0, 0.5]), jnp.array([0.0, 0.3])
 ORBIT = jnp.array([0.7, 0.0]), jnp.array([0.0, 1.36])
 FORCED = {"x": jnp.array([[1.0, 0.2]])}, {"x": jnp.array([[0.0, -0.5]])}
@@ -240,6 +245,13 @@ def test_single_precision():
         chosen(dps.TunedRKN6(), 1e-8)
     assert "`Compensated(TunedRKN6(...))`" in str(error.value)
     assert "'jax_enable_x64'" in str(error.value)
+    # Below rounding from the start.
+    with pytest.raises(RuntimeError, match="in float32: rounding"):
+        choose(
+            *(SPRING, dps.TunedRKN6(), t0, t1, y0),
+            tolerance=1e-8,
+            ts=jnp.linspace(t0, t1, 81),
+        )
     with pytest.raises(RuntimeError, match="Use double precision"):
         chosen(dps.Compensated(dps.TunedRKN6()), 1e-9)
 

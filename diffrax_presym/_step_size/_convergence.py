@@ -185,7 +185,8 @@ class Convergence:
             np.max(np.abs(np.asarray(a, float) - b)) / c
             for a, b, c in zip(coarse.leaves, fine.leaves, largest, strict=True)
         )
-        if self._regular and self._stalls >= 2 and change < eps**0.25:
+        rounding = change < 1e3 * eps or (self._regular and change < eps**0.25)
+        if self._stalls >= 2 and rounding:
             precision = fine.leaves[0].dtype
             more = (
                 ""
@@ -260,6 +261,7 @@ def _search(
     steepest: float,
 ) -> Trial:
     """A smaller number of steps than `high` that reaches the tolerance."""
+    failed = False
     for _ in range(6):
         numbers = between(low.steps, high.steps)
         if high.error >= ENOUGH or not numbers.size:
@@ -271,7 +273,10 @@ def _search(
             slope = math.log(low.error / error) / math.log(high.steps / low.steps)
             slope = min(slope, steepest)
         guess = high.steps * (error / AIM) ** (1 / slope)
+        if failed:  # Not again close to the lower end.
+            guess = max(guess, math.sqrt(low.steps * high.steps))
         n = int(numbers[np.argmin(np.abs(numbers - guess))])
         trial = Trial(n, measure(n))
-        low, high = (low, trial) if trial.error <= 1 else (trial, high)
+        failed = trial.error > 1
+        low, high = (trial, high) if failed else (low, trial)
     return high

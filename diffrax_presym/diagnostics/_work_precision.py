@@ -56,6 +56,8 @@ DIFFRAX = {"Tsit5": dfx.Tsit5(), "Dopri8": dfx.Dopri8()}
 
 # Evaluations of more constant steps than these are extrapolated.
 COUNTED_STEPS = 1000
+# Of an adaptive solve.
+MOST_STEPS = 1_000_000
 
 
 class WorkPrecisionRun(NamedTuple):
@@ -275,15 +277,16 @@ class Problem(NamedTuple):
     atol: float
 
     def solve(self, term, solver, dt0, controller):
-        known = isinstance(solver, AbstractPresymplecticSolver)
-        known = known and isinstance(controller, dfx.ConstantStepSize)
+        constant = isinstance(controller, dfx.ConstantStepSize)
+        known = constant and isinstance(solver, AbstractPresymplecticSolver)
         return dfx.diffeqsolve(
             *(term, solver, self.t0, self.t1, dt0, self.y0, self.args),
             saveat=dfx.SaveAt(ts=jnp.asarray(self.ts)),
             stepsize_controller=controller,
             # The loop that is recommended for this solver.
             adjoint=FixedStepAdjoint() if known else dfx.RecursiveCheckpointAdjoint(),
-            max_steps=None,
+            # Tolerances may be below rounding, where adaptive steps would not end.
+            max_steps=None if constant else MOST_STEPS,
             throw=False,
         )
 
@@ -429,9 +432,13 @@ def _reference(problem: Problem, level: float) -> Solution:
         sol = problem.solve(problem.term, solver, None, controller)
         return sol.ys, sol.result == dfx.RESULTS.successful
 
+    rounding = max(
+        jnp.finfo(jnp.result_type(y)).eps for y in jax.tree.leaves(problem.y0)
+    )
     difference = math.inf
     for factor in (1e-3, 1e-4, 1e-5):
-        factor = jnp.asarray(factor * level, problem.t0.dtype)
+        factor = max(factor * level, 10 * rounding / problem.rtol)
+        factor = jnp.asarray(factor, problem.t0.dtype)
         exact, other = (
             Solution.of(0, *solve(solver, problem, factor))
             for solver in (dfx.Dopri8(), dfx.Tsit5())
