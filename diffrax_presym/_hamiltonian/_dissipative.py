@@ -3,7 +3,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from .._friction import AbstractDamping, as_damping
+from .._friction import AbstractDamping, as_damping, check_scalar
 from .._misc import scalar_fn, tree_scale
 from ._energy import (
     AbstractMechanicalHamiltonian,
@@ -137,6 +137,7 @@ class _ScaledKinetic(AbstractKinetic):
         return self.kinetic.is_quadratic
 
     def _parts(self, t):
+        check_scalar(self.eta1, "DissipativeHamiltonian")
         eta2 = self.eta2(t)
         return jnp.exp(eta2 - self.eta1(t)), self.kinetic.rescale(eta2)
 

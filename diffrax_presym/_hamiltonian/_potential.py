@@ -4,7 +4,7 @@ from jaxtyping import Array, Inexact, PyTree
 
 from .._friction._base import Scalar, Time
 from .._misc import tree_dot
-from ._quadratic import as_form, multiply
+from .._forms import as_form, multiply
 
 
 _STIFFNESS = "`QuadraticPotential(stiffness)`"

@@ -1,14 +1,20 @@
 import abc
 import bisect
 from functools import partial
-from typing import ClassVar, Generic, TYPE_CHECKING, TypeVar
+from typing import ClassVar, Generic, NamedTuple, TYPE_CHECKING, TypeVar
 
 import diffrax as dfx
 import jax.lax as lax
+import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, PyTree
 
+<<<<<<< HEAD
 from .._interpolation import HermiteInterpolation, inner_points
+=======
+from .._interpolation import HermiteInterpolation
+>>>>>>> 2328880 (Friction by degree of freedom, matrix, place and speed: laws and MechanicalSystem)
 from .._misc import cast_to, tree_scale
 from .._split import State
 from .._system import check_state, System
@@ -22,6 +28,7 @@ from ._engine import (
     Result,
     Span,
     Stage,
+    time_lengths,
 )
 
 
@@ -36,6 +43,21 @@ _Carry = TypeVar("_Carry")
 
 # Points within a step that dense output uses, from the order up to which they suffice.
 _ORDERS, _INNER_POINTS = (2, 4, 10), (0, 1, 3, 5)
+
+
+class Tabulated(NamedTuple):
+    """A solver state, and what friction computes once for steps of one length."""
+
+    carry: PyTree
+    h: Array
+    table: PyTree
+
+
+def untabulate(system: System, solver_state: PyTree) -> tuple[System, PyTree]:
+    """A system that knows the table, and the solver state without it."""
+    if not isinstance(solver_state, Tabulated):
+        return system, solver_state
+    return system.with_table(solver_state.table), solver_state.carry
 
 
 class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
@@ -111,10 +133,24 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
             "distance between them. Use `PresymplecticCoupled()`, for example."
         )
 
+    def lengths(self, system: System) -> np.ndarray:
+        """The lengths of the stages over which friction acts, in units of the step."""
+        return time_lengths(self.moves(system))
+
     def init(self, terms, t0, t1, y0, args) -> _Carry:
         system = as_system(terms, args)
         check_state(y0)
-        return self.start(system, system.time(t0), y0)
+        t0, t1 = system.time(t0), system.time(t1)
+        carry = self.start(system, t0, y0)
+        if system.friction is None or not system.friction.has_table(y0[1]):
+            return carry
+        h = self.step_length(t0, t1)
+        return Tabulated(carry, h, self._tabulate(system, h, y0))
+
+    def _tabulate(self, system: System, h: Array, y: State) -> PyTree:
+        lengths = cast_to(self.lengths(system), h)
+        times = jnp.concatenate([lengths, -lengths]) * h
+        return system.friction.tabulate(y[1], times)
 
     def attempt(
         self, system: System, t0: Array, t1: Array, y: State, carry: _Carry
@@ -140,6 +176,24 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         system = as_system(terms, args)
+        if not isinstance(solver_state, Tabulated):
+            return self._step(system, t0, t1, y0, solver_state, made_jump)
+        # The table is that of the first step, and computed again for other lengths.
+        carry, nominal, table = solver_state
+        h = self.step_length(system.time(t0), system.time(t1))
+        rounding = 4 * jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+        table = lax.cond(
+            jnp.abs(h - nominal) <= jnp.minimum(rounding, jnp.abs(nominal) / 100),
+            lambda: table,
+            lambda: self._tabulate(system, h, y0),
+        )
+        system = system.with_table(table)
+        y1, error, dense_info, carry, result = self._step(
+            system, t0, t1, y0, carry, made_jump
+        )
+        return y1, error, dense_info, solver_state._replace(carry=carry), result
+
+    def _step(self, system: System, t0, t1, y0, solver_state, made_jump):
         t0, t1 = system.time(t0), system.time(t1)
         carry = solver_state
         # After a jump the solver state is stale. Mostly `made_jump` is the Python bool

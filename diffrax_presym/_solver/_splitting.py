@@ -96,9 +96,9 @@ class AbstractSplitting(AbstractMoveSolver[PyTree]):
         ends = drifts[: len(pairs), 1]
         table = np.stack([ends, ends, pairs], axis=-1)
         table = np.stack([drifts[: len(pairs)], table], axis=1)
-        stages = Stages([flow, kick(kind)], table)
+        stages = Stages([flow, kick(kind, tableau.order)], table)
         if tableau.kick_first:
-            moves = enter, kick(kind, known=True), stages, enter.inverse
+            moves = enter, kick(kind, tableau.order, known=True), stages, enter.inverse
             spans = [(0, 0, 0), (0, 0, kicks[0]), (0, 1, 1), (1, 1, 0)]
         else:
             moves = enter, stages, flow, enter.inverse
