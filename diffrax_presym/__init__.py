@@ -76,7 +76,6 @@ from ._solver import (
 from ._split import (
     AbstractSplit as AbstractSplit,
     KineticSplit as KineticSplit,
-    LocalSplit as LocalSplit,
     PotentialSplit as PotentialSplit,
     SharedSplit as SharedSplit,
 )

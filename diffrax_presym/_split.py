@@ -13,7 +13,7 @@ adds to the second of the pair.
 """
 
 import abc
-from typing import TYPE_CHECKING, TypeAlias
+from typing import cast, TYPE_CHECKING, TypeAlias
 
 import equinox as eqx
 import jax
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     # To a type checker an abstract field is any kind of field.
     from typing import ClassVar as AbstractVar
 
-    from ._hamiltonian import QuadraticKinetic
+    from ._hamiltonian import MechanicalSystem, QuadraticKinetic
     from ._system import System
 else:
     from equinox import AbstractVar
@@ -59,8 +59,8 @@ class AbstractSplit(eqx.Module):
 
     @abc.abstractmethod
     def force(self, system: "System", t: Time, z: State) -> PyTree:
-        """What a kick needs to know of the first variable: by default the rate of change
-        of the second."""
+        """What a kick needs to know of the first variable: by default the rate of
+        change of the second."""
 
     def kick(
         self, system: "System", t: Time, h: Time, z: State, force: PyTree, order: int
@@ -116,15 +116,19 @@ class LocalSplit(AbstractSplit):
 
     def force(self, system: "System", t: Time, z: State) -> PyTree:
         q, _ = system.values(z)
-        values = system.hamiltonian.local_values(t, q, system.args)
+        values = _mechanical(system).local_values(t, q, system.args)
         return system.potential_force(t, z), values
 
     def kick(
         self, system: "System", t: Time, h: Time, z: State, force: PyTree, order: int
     ) -> State:
-        q, p = z
-        change = system.hamiltonian.kick(t, h, system.values(p), *force, order)
+        (q, p), (force, values) = z, force
+        change = _mechanical(system).kick(t, h, system.values(p), force, values, order)
         return q, system.add(p, 1, change)
+
+
+def _mechanical(system: "System") -> "MechanicalSystem":
+    return cast("MechanicalSystem", system.hamiltonian)
 
 
 class PotentialSplit(AbstractSplit):

@@ -4,9 +4,9 @@ from ._damping import (
     as_damping as as_damping,
     check_scalar as check_scalar,
     ConstantDamping as ConstantDamping,
+    is_scalar as is_scalar,
     LogDamping as LogDamping,
     MixedDamping as MixedDamping,
-    is_scalar as is_scalar,
     SumDamping as SumDamping,
 )
 from ._drag import Drag as Drag

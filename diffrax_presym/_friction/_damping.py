@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 from .._forms import fit_form, is_matrix
-from .._misc import as_finite, as_time, cast_to, largest, tree_scale, tree_sub, tree_sum
+from .._misc import as_finite, as_time, cast_to, tree_scale, tree_sub, tree_sum
 from ._base import AbstractFriction, Numbers, Scalar, Time
 from ._functions import expm1, expm1_ratio, log_growth, quadrature
 

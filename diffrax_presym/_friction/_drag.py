@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
 from .._forms import fit_form, is_operator
-from .._misc import as_finite, as_parameter, cast_to
+from .._misc import as_parameter, cast_to
 from ._base import Numbers, Scalar, Time
 from ._damping import as_numbers
 from ._functions import expm1, expm1_ratio, log1p_ratio
@@ -71,8 +71,8 @@ class Drag(eqx.Module):
         valid = isinstance(exponent, Tracer) or bool(np.all(np.asarray(exponent) >= 1))
         if not valid or (jnp.ndim(exponent) and not isinstance(exponent, Tracer)):
             raise ValueError(
-                "`Drag(..., exponent)` must be a number of at least 1, the power of the "
-                f"speed in the force, but got {exponent}. Drag with a smaller power "
+                "`Drag(..., exponent)` must be a number of at least 1, the power of "
+                f"the speed in the force, but got {exponent}. A smaller power "
                 "stops a body in finite time; write it as "
                 "`MechanicalSystem(..., force=f)` and make it smooth at rest."
             )

@@ -58,7 +58,9 @@ def exponentials(
 
         return lax.cond(i < halvings, doubled, lambda x: x, x), None
 
-    (change, mean), _ = lax.scan(double, (change, mean), np.arange(_SQUARINGS, dtype=z.dtype))
+    (change, mean), _ = lax.scan(
+        double, (change, mean), np.arange(_SQUARINGS, dtype=z.dtype)
+    )
     length = jnp.expand_dims(times, range(1, mean.ndim))
     valid = lambda x: jnp.where(solvable, x, jnp.nan)
     return valid(change), valid(length * mean)

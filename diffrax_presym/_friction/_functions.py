@@ -93,7 +93,9 @@ def _log1p_ratio_jvp(x, dx):
     value, small = log1p_ratio(x), jnp.abs(x) < 0.05
     near, far = jnp.where(small, x, 0), jnp.where(small, 1, x)
     terms = [-((-1) ** k) * (k + 1) / (k + 2) for k in range(14)]
-    return value, jnp.where(small, _horner(terms, near), (1 / (1 + far) - value) / far) * dx
+    return value, jnp.where(
+        small, _horner(terms, near), (1 / (1 + far) - value) / far
+    ) * dx
 
 
 def _series(x: Scalar, derivative: int = 0) -> Scalar:

@@ -229,7 +229,7 @@ class ViscousFriction(AbstractFriction):
     @property
     def _by_products(self) -> bool:
         """Whether the friction is given by products alone."""
-        return any(is_operator(x) and not _is_explicit(x) for x in self._forms())
+        return any(map(_is_implicit, self._forms()))
 
     def _times(self, p: PyTree) -> PyTree:
         """R p + C M^-1 p."""
@@ -239,7 +239,9 @@ class ViscousFriction(AbstractFriction):
             parts += [multiply(x, v, _COEFFICIENTS, "p") for x in self.coefficients]
         return functools.reduce(tree_sum, parts)
 
-    def _leaves(self, p: PyTree) -> tuple[list[Array], list[Array | None], Callable]:
+    def _leaves(
+        self, p: PyTree
+    ) -> tuple[list[Array], Sequence[Array | None], Callable]:
         """Arrays that are independent of each other, and their rates: of each entry, as
         a matrix, or `None` if the rate is known by products. Also the inverse."""
         if any(map(is_operator, self._forms())):
@@ -275,7 +277,7 @@ class ViscousFriction(AbstractFriction):
         def one(i, x, rate):
             if rate is None:
                 return product(x, self._ravelled(p))
-            if _has_matrix(x, rate):
+            if is_matrix(rate, x):
                 return matrix(x, rate, i)
             law = self.law
             law = ConstantDamping(rate) if law is None else ScaledDamping(law, rate)
@@ -285,7 +287,7 @@ class ViscousFriction(AbstractFriction):
         return back([one(i, x, rate) for i, (x, rate) in enumerate(parts)])
 
     def _exponential(self, matrix: Array, i: int, t: Time, x: Time):
-        """The change and the integral over a time `x`, from the table if it is there."""
+        """The change and the integral over a time `x`, from the table if known."""
         x = cast_to(x, matrix)
 
         def compute():
@@ -317,7 +319,12 @@ class ViscousFriction(AbstractFriction):
         return self._integral(
             p,
             lambda x, law: law.carry(t, h, x, order),
-            *(t, h, weights, lambda law: jax.vmap(lambda s: law.increment(t, s))(nodes)),
+            *(
+                t,
+                h,
+                weights,
+                lambda law: jax.vmap(lambda s: law.increment(t, s))(nodes),
+            ),
         )
 
     def respond(self, t: Time, h: Time, force: PyTree, order: int) -> PyTree:
@@ -392,17 +399,18 @@ class ViscousFriction(AbstractFriction):
         if self.law is not None or self.table is not None:
             return False
         leaves, rates, _ = self._leaves(p)
-        return any(map(_has_matrix, leaves, rates))
+        pairs = zip(leaves, rates, strict=True)
+        return any(rate is not None and is_matrix(rate, x) for x, rate in pairs)
 
     def tabulate(self, p: PyTree, times: Array) -> _Table:
         leaves, rates, _ = self._leaves(p)
-        return _Table(
-            times,
-            [
-                exponentials(rate, times) if _has_matrix(x, rate) else None
-                for x, rate in zip(leaves, rates, strict=True)
-            ],
-        )
+
+        def entry(x: Array, rate: Array | None):
+            if rate is None or not is_matrix(rate, x):
+                return None
+            return exponentials(rate, times)
+
+        return _Table(times, list(map(entry, leaves, rates)))
 
     def with_table(self, table: _Table) -> "ViscousFriction":
         return ViscousFriction(
@@ -410,20 +418,19 @@ class ViscousFriction(AbstractFriction):
         )
 
 
-def _has_matrix(x: Array, rate: Array | None) -> bool:
-    return rate is not None and is_matrix(rate, x)
-
-
-def _is_explicit(operator: lx.AbstractLinearOperator) -> bool:
-    """Whether an operator is given by its entries."""
+def _is_implicit(form: Form) -> bool:
+    """Whether a form is an operator that is not given by its entries."""
     known = (
         lx.MatrixLinearOperator,
         lx.DiagonalLinearOperator,
         lx.TridiagonalLinearOperator,
         lx.IdentityLinearOperator,
     )
-    parts = [x for x in vars(operator).values() if is_operator(x)]
-    return isinstance(operator, known) or (bool(parts) and all(map(_is_explicit, parts)))
+    if not is_operator(form) or isinstance(form, known):
+        return False
+    # Sums, products and tags of operators.
+    parts = [x for x in vars(form).values() if is_operator(x)]
+    return not parts or any(map(_is_implicit, parts))
 
 
 def _per_momentum(coefficient: Array, mass: Array, p: Array) -> Array:

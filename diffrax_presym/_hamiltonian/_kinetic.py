@@ -10,7 +10,7 @@ import lineax as lx
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
 from .._forms import as_form, divide, multiply
-from .._friction import AbstractFriction, is_scalar
+from .._friction import AbstractDamping, AbstractFriction
 from .._friction._base import Scalar, Time
 from .._friction._functions import gauss_legendre, quadrature
 from .._misc import (
@@ -170,7 +170,7 @@ class RelativisticKinetic(AbstractKinetic):
     def displacement(self, t, h, p, args, friction, order):
         if friction is None:
             return tree_scale(h, self.velocity(t, p, args))
-        if not is_scalar(friction):
+        if not (isinstance(friction, AbstractDamping) and friction.is_scalar):
             return integrate_velocity(self.velocity, t, h, p, args, friction, order)
         p, square, rest, unit = self._scaled(p)
 

@@ -17,7 +17,6 @@ from .._friction import (
     Drag,
     PositionDamping,
     RayleighDamping,
-    SumDamping,
     ViscousDamping,
     ViscousFriction,
 )
@@ -128,7 +127,7 @@ class MechanicalSystem(AbstractHamiltonian):
     def _check(self, law: Law) -> None:
         name = type(law).__name__
         needs_mass = isinstance(law, ViscousDamping | RayleighDamping | Drag)
-        if needs_mass and not self._knows_mass:
+        if needs_mass and self._kinetic is None:
             raise ValueError(
                 f"`{name}` is friction per velocity, and needs to know the mass. Write "
                 "the kinetic energy as `QuadraticKinetic(mass)`; or write the friction "
@@ -147,22 +146,30 @@ class MechanicalSystem(AbstractHamiltonian):
     # Its parts.
 
     @property
-    def _knows_mass(self) -> bool:
-        E = self.E
-        return isinstance(E, SeparableEnergy) and isinstance(E.kinetic, QuadraticKinetic)
+    def _kinetic(self) -> QuadraticKinetic | None:
+        """The kinetic energy, if its mass is known."""
+        kinetic = self.E.kinetic if isinstance(self.E, SeparableEnergy) else None
+        return kinetic if isinstance(kinetic, QuadraticKinetic) else None
 
     @property
     def _mass(self):
-        return self.E.kinetic.mass if self._knows_mass else None
+        return None if self._kinetic is None else self._kinetic.mass
 
     @property
     def _potential(self):
         return self.E.potential if isinstance(self.E, SeparableEnergy) else None
 
     @property
+    def _linear(self) -> list[AbstractDamping | ViscousDamping | RayleighDamping]:
+        """The linear friction that does not depend on place."""
+        kinds = (AbstractDamping, ViscousDamping, RayleighDamping)
+        return [x for x in self.laws if isinstance(x, kinds) and not _is_local(x)]
+
+    @property
     def _local(self) -> list[PositionDamping | ViscousDamping | Drag]:
         """The friction that depends on place."""
-        return [law for law in self.laws if _is_local(law)]
+        kinds = (PositionDamping, ViscousDamping, Drag)
+        return [x for x in self.laws if isinstance(x, kinds) and _is_local(x)]
 
     @property
     def _drags(self) -> list[Drag]:
@@ -172,10 +179,11 @@ class MechanicalSystem(AbstractHamiltonian):
     @property
     def friction(self) -> AbstractFriction | None:
         """The linear friction that does not depend on place, part of every drift."""
-        laws = [x for x in self.laws if not (_is_local(x) or isinstance(x, Drag))]
         stiffness = getattr(self._potential, "stiffness", None)
-        friction = as_friction(laws, self._mass, stiffness)
-        return friction if self.table is None else friction.with_table(self.table)
+        friction = as_friction(self._linear, self._mass, stiffness)
+        if friction is None or self.table is None:
+            return friction
+        return friction.with_table(self.table)
 
     def with_table(self, table: PyTree) -> "MechanicalSystem":
         is_none = lambda x: x is None
@@ -184,15 +192,15 @@ class MechanicalSystem(AbstractHamiltonian):
     @property
     def damping(self) -> AbstractDamping | None:
         """The damping law, if that is all of the friction."""
-        if not self.laws:
-            return None
-        if all(isinstance(law, AbstractDamping) for law in self.laws):
-            return self.laws[0] if len(self.laws) == 1 else SumDamping(self.laws)
-        raise ValueError(
-            "Only one rate of damping for all momenta has a log scale and a canonical "
-            "momentum, but this `MechanicalSystem` has other friction. Use "
-            "`energy(t, q, p)` and `diagnostics.power_lost`."
-        )
+        friction = self.friction
+        if len(self._linear) < len(self.laws) or isinstance(friction, ViscousFriction):
+            raise ValueError(
+                "Only one rate of damping for all momenta has a log scale and a "
+                "canonical momentum, but this `MechanicalSystem` has other friction. "
+                "Use `energy(t, q, p)` and `diagnostics.power_lost`."
+            )
+        assert friction is None or isinstance(friction, AbstractDamping)
+        return friction
 
     # The vector field.
 

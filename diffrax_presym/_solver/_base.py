@@ -145,12 +145,15 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         if system.friction is None or not system.friction.has_table(y0[1]):
             return carry
         h = self.step_length(t0, t1)
-        return Tabulated(carry, h, self._tabulate(system, h, y0))
+        table = self._tabulate(system, h, y0)
+        return Tabulated(carry, h, table)  # pyright: ignore[reportReturnType]
 
     def _tabulate(self, system: System, h: Array, y: State) -> PyTree:
         lengths = cast_to(self.lengths(system), h)
         times = jnp.concatenate([lengths, -lengths]) * h
-        return system.friction.tabulate(y[1], times)
+        return (
+            None if system.friction is None else system.friction.tabulate(y[1], times)
+        )
 
     def attempt(
         self, system: System, t0: Array, t1: Array, y: State, carry: _Carry
