@@ -188,6 +188,19 @@ class LagrangianSystem(AbstractHamiltonian):
             force = force + match(value, q, "`force`", "`q`")
         return v, force
 
+    @property
+    def is_conservative(self) -> bool:
+        """Whether there is neither friction nor a further force."""
+        return self.coefficients is None and self.force_fn is None
+
+    def friction_force(
+        self, t: Time, q: _Vector, p: _Vector, args: PyTree = None
+    ) -> _Vector:
+        v = self.to_velocity(t, q, p, args)
+        if self.coefficients is None:
+            return jnp.zeros_like(v)
+        return -multiply(self.coefficients, v, _FRICTION, "q")
+
     def _potential(self, t, q, args):
         return cast_to(scalar_fn(self.potential, "The potential")(t, q, args), q)
 

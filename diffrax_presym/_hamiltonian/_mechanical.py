@@ -185,6 +185,11 @@ class MechanicalSystem(AbstractHamiltonian):
             return friction
         return friction.with_table(self.table)
 
+    @property
+    def is_linear(self) -> bool:
+        """Whether all friction is linear and does not depend on place."""
+        return self.external is None and len(self._linear) == len(self.laws)
+
     def with_table(self, table: PyTree) -> "MechanicalSystem":
         is_none = lambda x: x is None
         return eqx.tree_at(lambda x: x.table, self, table, is_leaf=is_none)

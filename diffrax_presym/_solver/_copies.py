@@ -6,6 +6,7 @@ within a step is `y, (copy, field)`, with the velocity and force of the last exc
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import diffrax as dfx
 import jax
@@ -96,8 +97,8 @@ def _check_distance(system: System, span: Span, stage: Stage) -> Outcome:
         rounding = eps ** (1 / 3) * jnp.maximum(*sizes)
         pairs = zip(sizes, distances, strict=True)
         q, p = (d > jnp.maximum(size, rounding) for size, d in pairs)
-    failed = dfx.RESULTS.nonlinear_divergence
-    return stage, dfx.RESULTS.where(q | p, failed, dfx.RESULTS.successful)
+    failure: Any = dfx.RESULTS.nonlinear_divergence
+    return stage, dfx.RESULTS.where(q | p, failure, dfx.RESULTS.successful)
 
 
 def _keep(system: System, span: Span, stage: Stage) -> Outcome:
