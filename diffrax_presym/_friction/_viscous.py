@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -204,11 +203,37 @@ def _scaled(beta: Scalar, form: Form) -> Form:
     return form * beta if is_operator(form) else tree_scale(beta, form)
 
 
-class _Table(NamedTuple):
+class _Table(eqx.Module):
     """The exponentials over some times, for each leaf with a matrix."""
 
     times: Inexact[Array, " times"]
+    # Half of the least distance between two of the times.
+    radius: Scalar
     entries: list[tuple[Array, Array] | None]
+    # Whether no other times occur.
+    complete: bool = eqx.field(static=True, default=True)
+
+    def assume(self, complete: bool) -> "_Table":
+        """The same table, with or without the assumption that no other times occur."""
+        return _Table(self.times, self.radius, self.entries, complete)
+
+    def at(self, i: int, t: Time, x: Array, compute: Callable) -> tuple[Array, Array]:
+        entry = self.entries[i]
+        assert entry is not None
+        distances = jnp.abs(cast_to(self.times, x) - x)
+        nearest = jnp.argmin(distances)
+        distance, radius = distances[nearest], cast_to(self.radius, x)
+        stored = lambda: tuple(cast_to(part[nearest], x) for part in entry)
+        if self.complete:
+            valid = distance <= radius
+            change, integral = stored()
+            return jnp.where(valid, change, jnp.nan), jnp.where(
+                valid, integral, jnp.nan
+            )
+        # Times of other steps, and times that differ by more than rounding.
+        rounding = 4 * jnp.finfo(x.dtype).eps * (jnp.abs(cast_to(t, x)) + jnp.abs(x))
+        found = distance <= jnp.minimum(rounding, radius)
+        return jax.lax.cond(found, stored, compute)
 
 
 class ViscousFriction(AbstractFriction):
@@ -295,13 +320,7 @@ class ViscousFriction(AbstractFriction):
 
         if self.table is None:
             return compute()
-        entry = self.table.entries[i]
-        assert entry is not None
-        times = cast_to(self.table.times, matrix)
-        nearest = jnp.argmin(jnp.abs(times - x))
-        found = _is_close(times[nearest], x, t, _spacing(times))
-        stored = lambda: tuple(part[nearest] for part in entry)
-        return jax.lax.cond(found, stored, compute)
+        return self.table.at(i, t, x, compute)
 
     # What it does.
 
@@ -410,7 +429,9 @@ class ViscousFriction(AbstractFriction):
                 return None
             return exponentials(rate, times)
 
-        return _Table(times, list(map(entry, leaves, rates)))
+        gaps = jnp.diff(jnp.sort(times))
+        radius = jnp.min(gaps, initial=jnp.inf) / 2
+        return _Table(times, radius, list(map(entry, leaves, rates)))
 
     def with_table(self, table: _Table) -> "ViscousFriction":
         return ViscousFriction(
@@ -459,18 +480,3 @@ def _as_matrix(rate: Array, like: Array) -> Array:
         return rate
     entries = jnp.broadcast_to(rate, jnp.shape(like))
     return entries[..., None] * jnp.eye(entries.shape[-1], dtype=entries.dtype)
-
-
-def _spacing(times: Array) -> Array:
-    """A quarter of the least distance between unequal times."""
-    distances = jnp.abs(times[:, None] - times[None, :])
-    tiny = 1e-9 if times.dtype == jnp.float64 else 1e-4
-    close = distances <= tiny * jnp.max(jnp.abs(times))
-    return jnp.min(jnp.where(close, jnp.inf, distances)) / 4
-
-
-def _is_close(x: Array, y: Array, t: Time, spacing: Array) -> Bool[Array, ""]:
-    """Whether two times differ by the rounding of `t` alone."""
-    t = cast_to(t, y)
-    rounding = 4 * jnp.finfo(y.dtype).eps * (jnp.abs(t) + jnp.abs(y))
-    return jnp.abs(x - y) <= jnp.minimum(rounding, spacing)

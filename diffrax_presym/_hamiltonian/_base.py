@@ -46,6 +46,11 @@ class AbstractHamiltonian(eqx.Module):
         check_scalar(self.damping, type(self).__name__)
         return self.damping
 
+    @property
+    def friction_table(self) -> PyTree:
+        """What `with_table` was given, or `None`."""
+        return None
+
     def with_table(self, table: PyTree) -> "AbstractHamiltonian":
         """The same system, whose friction uses the result of its `tabulate`."""
         return self

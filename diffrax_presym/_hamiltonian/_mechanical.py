@@ -190,6 +190,10 @@ class MechanicalSystem(AbstractHamiltonian):
         """Whether all friction is linear and does not depend on place."""
         return self.external is None and len(self._linear) == len(self.laws)
 
+    @property
+    def friction_table(self) -> PyTree:
+        return self.table
+
     def with_table(self, table: PyTree) -> "MechanicalSystem":
         is_none = lambda x: x is None
         return eqx.tree_at(lambda x: x.table, self, table, is_leaf=is_none)

@@ -10,11 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-<<<<<<< HEAD
 from .._interpolation import HermiteInterpolation, inner_points
-=======
-from .._interpolation import HermiteInterpolation
->>>>>>> 2328880 (Friction by degree of freedom, matrix, place and speed: laws and MechanicalSystem)
 from .._misc import cast_to, tree_scale
 from .._split import State
 from .._system import check_state, System
@@ -49,15 +45,12 @@ class Tabulated(NamedTuple):
     """A solver state, and what friction computes once for steps of one length."""
 
     carry: PyTree
-    h: Array
     table: PyTree
 
 
-def untabulate(system: System, solver_state: PyTree) -> tuple[System, PyTree]:
-    """A system that knows the table, and the solver state without it."""
-    if not isinstance(solver_state, Tabulated):
-        return system, solver_state
-    return system.with_table(solver_state.table), solver_state.carry
+def signed(lengths: np.ndarray) -> np.ndarray:
+    """Lengths forwards and backwards in time, in order."""
+    return np.unique(np.concatenate([-lengths, lengths]))
 
 
 class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
@@ -145,21 +138,37 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         if system.friction is None or not system.friction.has_table(y0[1]):
             return carry
         h = self.step_length(t0, t1)
-        table = self._tabulate(system, h, y0)
-        return Tabulated(carry, h, table)  # pyright: ignore[reportReturnType]
+        system = self.tabulated(system, h, y0)
+        return Tabulated(carry, system.table)  # pyright: ignore[reportReturnType]
 
-    def _tabulate(self, system: System, h: Array, y: State) -> PyTree:
-        lengths = cast_to(self.lengths(system), h)
-        times = jnp.concatenate([lengths, -lengths]) * h
-        return (
-            None if system.friction is None else system.friction.tabulate(y[1], times)
-        )
+    def tabulated(self, system: System, h: Array, y: State) -> System:
+        """The system, with what friction computes once for a step of this length."""
+        if system.friction is None:
+            return system
+        times = cast_to(signed(self.lengths(system)), h) * h
+        return system.with_table(system.friction.tabulate(y[1], times))
+
+    def fitted(self, system: System, t: Array, h: Array, y: State) -> System:
+        """The same if the system has a table already, of a step of any length."""
+        table = system.table
+        if table is None:
+            return system
+        lengths = signed(self.lengths(system))
+        times = cast_to(lengths, h) * h
+        # Neighbours must not be mistaken for each other.
+        gap = np.min(np.diff(lengths), initial=1.0) / np.max(lengths, initial=1.0)
+        eps = jnp.finfo(h.dtype).eps
+        rounding = jnp.minimum(4 * eps * jnp.abs(t), float(gap) / 8 * jnp.abs(h))
+        fits = jnp.all(jnp.abs(times - table.times) <= rounding + 4 * eps * jnp.abs(h))
+        table, compute = table.assume(True), lambda: self.tabulated(system, h, y).table
+        return system.with_table(lax.cond(fits, lambda: table, compute))
 
     def attempt(
         self, system: System, t0: Array, t1: Array, y: State, carry: _Carry
     ) -> tuple[State, _Carry, Result]:
         """One step, with a failure if its end is invalid."""
         h = self.step_length(t0, t1)
+        system = self.fitted(system, t1, h, y)
         y, carry, result = self.advance(system, t0, t1, h, y, carry)
         return y, carry, first_failure(result, system.check(t1, y))
 
@@ -175,26 +184,21 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
 
         By default a shorter step of the scheme from the start of the step.
         """
-        return self.advance(system, t0, t, self.step_length(t0, t), *start)[0]
+        h = self.step_length(t0, t)
+        if system.table is not None:
+            system = self.tabulated(system, h, start[0])
+        return self.advance(system, t0, t, h, *start)[0]
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         system = as_system(terms, args)
         if not isinstance(solver_state, Tabulated):
             return self._step(system, t0, t1, y0, solver_state, made_jump)
-        # The table is that of the first step, and computed again for other lengths.
-        carry, nominal, table = solver_state
-        h = self.step_length(system.time(t0), system.time(t1))
-        rounding = 4 * jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
-        table = lax.cond(
-            jnp.abs(h - nominal) <= jnp.minimum(rounding, jnp.abs(nominal) / 100),
-            lambda: table,
-            lambda: self._tabulate(system, h, y0),
-        )
-        system = system.with_table(table)
-        y1, error, dense_info, carry, result = self._step(
-            system, t0, t1, y0, carry, made_jump
-        )
-        return y1, error, dense_info, solver_state._replace(carry=carry), result
+        carry, table = solver_state
+        times = system.time(t0), system.time(t1)
+        h = self.step_length(*times)
+        system = self.fitted(system.with_table(table), times[1], h, y0)
+        *outputs, carry, result = self._step(system, t0, t1, y0, carry, made_jump)
+        return *outputs, Tabulated(carry, system.table), result
 
     def _step(self, system: System, t0, t1, y0, solver_state, made_jump):
         t0, t1 = system.time(t0), system.time(t1)
