@@ -59,7 +59,8 @@ class AbstractSplitting(AbstractMoveSolver[PyTree]):
             return split
         if self.kind == "shared":
             raise ValueError(
-                f"`{name}` needs a known mass that does not depend on time. Write "
+                f"`{name}` needs a known mass that does not depend on time, and one "
+                "rate of friction for all momenta. Write "
                 "`ConformalHamiltonian(QuadraticKinetic(mass), potential, damping)` or "
                 "`SeparableHamiltonian(QuadraticKinetic(mass), potential)`. Otherwise "
                 "use `TunedRKN6()` or `BlanesMoan6()`."
@@ -70,12 +71,14 @@ class AbstractSplitting(AbstractMoveSolver[PyTree]):
                 f"potential, but this `{system.name}` is not. "
                 "If it is a sum of the two, give its parts: `SeparableHamiltonian("
                 "kinetic, potential)` or `ConformalHamiltonian(kinetic, potential, "
-                "damping)`. Otherwise use `PresymplecticCoupled()`."
+                "damping)`. Otherwise use `PresymplecticCoupled()`, or with a force "
+                "that depends on the velocity `PresymplecticGauss()`."
             )
         raise ValueError(
             f"`{name}` keeps its order only for a quadratic kinetic energy, written as "
             "`QuadraticKinetic(mass)`, or a quadratic potential, written as "
-            "`QuadraticPotential(stiffness)`. Otherwise use `BlanesMoan4()` or "
+            "`QuadraticPotential(stiffness)`; and for friction that depends neither on "
+            "positions nor on the speed. Otherwise use `BlanesMoan4()` or "
             "`BlanesMoan6()`."
         )
 
