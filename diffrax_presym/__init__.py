@@ -9,8 +9,12 @@ from ._friction import (
     AbstractDamping as AbstractDamping,
     AbstractFriction as AbstractFriction,
     ConstantDamping as ConstantDamping,
+    Drag as Drag,
     LogDamping as LogDamping,
     MixedDamping as MixedDamping,
+    PositionDamping as PositionDamping,
+    RayleighDamping as RayleighDamping,
+    ViscousDamping as ViscousDamping,
 )
 from ._hamiltonian import (
     AbstractHamiltonian as AbstractHamiltonian,
@@ -27,6 +31,7 @@ from ._hamiltonian import (
     HyperbolicMirror as HyperbolicMirror,
     LagrangianSystem as LagrangianSystem,
     LogBarrierMirror as LogBarrierMirror,
+    MechanicalSystem as MechanicalSystem,
     MirrorMap as MirrorMap,
     PNormMirror as PNormMirror,
     PolynomialScaling as PolynomialScaling,

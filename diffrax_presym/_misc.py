@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 import optimistix as optx
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Inexact, PyTree
@@ -20,10 +21,18 @@ def as_parameter(x, name: str) -> Inexact[Array, "..."]:
     return jnp.asarray(x)
 
 
+def as_finite(x, name: str) -> Inexact[Array, "..."]:
+    """As `as_parameter`, and checked to be finite unless it is traced."""
+    x = as_parameter(x, name)
+    if not isinstance(x, Tracer) and not np.all(np.isfinite(np.asarray(x))):
+        raise ValueError(f"{name} must be finite, but got {x}.")
+    return x
+
+
 def as_positive(x, name: str, instead: str = "") -> Inexact[Array, "..."]:
     """As `as_parameter`, and checked to be positive unless it is traced."""
     x = as_parameter(x, name)
-    if not isinstance(x, Tracer) and not bool(jnp.all(x > 0)):
+    if not isinstance(x, Tracer) and not np.all(np.asarray(x) > 0):
         raise ValueError(f"{name} must be positive, but got {x}.{instead}")
     return x
 

@@ -13,7 +13,7 @@ adds to the second of the pair.
 """
 
 import abc
-from typing import TYPE_CHECKING, TypeAlias
+from typing import cast, TYPE_CHECKING, TypeAlias
 
 import equinox as eqx
 import jax
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     # To a type checker an abstract field is any kind of field.
     from typing import ClassVar as AbstractVar
 
-    from ._hamiltonian import QuadraticKinetic
+    from ._hamiltonian import MechanicalSystem, QuadraticKinetic
     from ._system import System
 else:
     from equinox import AbstractVar
@@ -59,7 +59,15 @@ class AbstractSplit(eqx.Module):
 
     @abc.abstractmethod
     def force(self, system: "System", t: Time, z: State) -> PyTree:
-        """The rate of change of the second variable during a kick."""
+        """What a kick needs to know of the first variable: by default the rate of
+        change of the second."""
+
+    def kick(
+        self, system: "System", t: Time, h: Time, z: State, force: PyTree, order: int
+    ) -> State:
+        """The flow of the other part at fixed time, over a length `h`."""
+        first, second = z
+        return first, system.add(second, h, force)
 
 
 class KineticSplit(AbstractSplit):
@@ -87,6 +95,40 @@ class KineticSplit(AbstractSplit):
 
     def force(self, system: "System", t: Time, z: State) -> PyTree:
         return system.potential_force(t, z)
+
+
+class LocalSplit(AbstractSplit):
+    """The drift is the flow of the kinetic part, and the kick that of the potential and
+    of friction that depends on place, for [`diffrax_presym.MechanicalSystem`][]."""
+
+    @property
+    def kinds(self) -> frozenset[str]:
+        return frozenset({"any"})
+
+    def to_split(self, system: "System", t: Time, y: State) -> State:
+        return y
+
+    def from_split(self, system: "System", t: Time, z: State) -> State:
+        return z
+
+    def drift(self, system: "System", t: Time, h: Time, z: State, order: int) -> State:
+        return system.drift(t, h, z, order)
+
+    def force(self, system: "System", t: Time, z: State) -> PyTree:
+        q, _ = system.values(z)
+        values = _mechanical(system).local_values(t, q, system.args)
+        return system.potential_force(t, z), values
+
+    def kick(
+        self, system: "System", t: Time, h: Time, z: State, force: PyTree, order: int
+    ) -> State:
+        (q, p), (force, values) = z, force
+        change = _mechanical(system).kick(t, h, system.values(p), force, values, order)
+        return q, system.add(p, 1, change)
+
+
+def _mechanical(system: "System") -> "MechanicalSystem":
+    return cast("MechanicalSystem", system.hamiltonian)
 
 
 class PotentialSplit(AbstractSplit):

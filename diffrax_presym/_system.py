@@ -63,7 +63,16 @@ class System(eqx.Module):
 
     @property
     def friction(self) -> AbstractFriction | None:
-        return self.hamiltonian.damping
+        return self.hamiltonian.friction
+
+    @property
+    def table(self) -> PyTree:
+        """What `with_table` was given, or `None`."""
+        return self.hamiltonian.friction_table
+
+    def with_table(self, table: PyTree) -> "System":
+        """The same system, whose friction uses the result of its `tabulate`."""
+        return System(self.hamiltonian.with_table(table), self.args, self.direction)
 
     def velocity(self, t: Time, y: State) -> PyTree:
         """The velocity, which is the derivative of `q`."""

@@ -8,8 +8,8 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from .._closures import closure_to_pytree
-from .._loop import Inputs, Plan
-from .._solver._base import AbstractPresymplecticSolver
+from .._loop import Inputs, Plan, Steps
+from .._solver._base import AbstractPresymplecticSolver, Tabulated
 from .._term import as_system
 from ._backward import Backward, Position
 from ._rule import call, refuse
@@ -50,6 +50,17 @@ class AbstractFixedStepAdjoint(dfx.AbstractAdjoint):
         if passed_controller_state:
             raise ValueError(refuse(self, "a `controller_state`"))
         y, carry = init_state.y, init_state.solver_state
+        tabulated = isinstance(carry, Tabulated)
+        if tabulated:
+            # Most steps are of one length, but not all.
+            steps = Steps(
+                *(rest[x] for x in ("stepsize_controller", "t0", "t1", "dt0"))
+            )
+            n = steps.total // 2
+            t0, t1 = (system.time(steps.time(n + i)) for i in (0, 1))
+            system, h = system.with_table(carry.table), solver.step_length(t0, t1)
+            table = solver.fitted(system, t1, h, y).table
+            system, carry = system.with_table(table.assume(False)), carry.carry
         if init_state.made_jump is not False:
             # The solver state is stale, and is recomputed before the first step.
             restart = lambda: solver.start(system, system.time(rest["t0"]), y)
@@ -67,7 +78,12 @@ class AbstractFixedStepAdjoint(dfx.AbstractAdjoint):
         out = self.solve(Inputs((y, carry), parameters, rest))
         # To JAX all outputs of a custom rule have derivatives, even integers.
         out, counts = eqx.partition(out, eqx.is_inexact_array)
-        return eqx.combine(out, eqxi.nondifferentiable_backward(counts)), {}
+        out = eqx.combine(out, eqxi.nondifferentiable_backward(counts))
+        if tabulated:
+            at_end = Tabulated(out.solver_state, system.table.assume(True))
+            where = lambda x: x.solver_state
+            out = eqx.tree_at(where, out, at_end, is_leaf=_is_none)
+        return out, {}
 
     def solve(self, inputs: Inputs):
         """Diffrax's final state, with a rule for its gradient."""

@@ -79,8 +79,9 @@ class ReversibleAdjoint(AbstractFixedStepAdjoint):
         if friction is not None:
             # Each part may amplify rounding up to the limit.
             t0, t1 = (system.time(plan.steps.time(n)) for n in (first, plan.last))
+            (_, p), _ = plan.start
             limit, eps = self.limit(plan.start[0])
-            amplified = jnp.log(friction.amplification(t0, t1 - t0))
+            amplified = jnp.log(friction.amplification(t0, t1 - t0, p))
             needed = 2 * amplified / max(math.log(limit / eps), 1)
             # Infinite or undefined amplification needs as many as there are.
             needed = jnp.where(needed < most, needed, most)

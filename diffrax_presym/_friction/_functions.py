@@ -5,11 +5,12 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array
 
 from .._misc import cast_to
-from ._base import Scalar, Time
+from ._base import Numbers, Scalar, Time
 
 
 def gauss_legendre(h: Time, order: int) -> tuple[Array, Array]:
@@ -18,10 +19,15 @@ def gauss_legendre(h: Time, order: int) -> tuple[Array, Array]:
     return cast_to((1 + nodes) / 2, h) * h, cast_to(weights / 2, h) * h
 
 
-def quadrature(fn: Callable, h: Time, order: int) -> Scalar:
-    """The integral of a scalar function of time, from 0 to `h`."""
+def quadrature(fn: Callable, h: Time, order: int) -> Numbers:
+    """The integral of a function of time, from 0 to `h`, leaf by leaf."""
     nodes, weights = gauss_legendre(h, order)
-    return jnp.sum(weights * cast_to(jax.vmap(fn)(nodes), h))
+
+    def integral(x):
+        parts = jnp.expand_dims(weights, range(1, x.ndim)) * cast_to(x, h)
+        return jnp.sum(parts, axis=0)
+
+    return jtu.tree_map(integral, jax.vmap(fn)(nodes))
 
 
 # exp(x) - 1 and its ratio to x, accurate to rounding near zero, with derivatives. XLA's
@@ -73,12 +79,35 @@ def _expm1_ratio_jvp(x, dx):
     return value, jnp.where(small, _series(near, 1), (jnp.exp(far) - value) / far) * dx
 
 
+@jax.custom_jvp
+def log1p_ratio(x: Scalar) -> Scalar:
+    """`log(1 + x) / x`, and NaN for `x <= -1`."""
+    zero = x == 0
+    value = jnp.log1p(x) / jnp.where(zero, 1, x)
+    return jnp.where(zero, 1, jnp.where(x > -1, value, jnp.nan))
+
+
+@log1p_ratio.defjvp
+def _log1p_ratio_jvp(x, dx):
+    (x,), (dx,) = x, dx
+    value, small = log1p_ratio(x), jnp.abs(x) < 0.05
+    near, far = jnp.where(small, x, 0), jnp.where(small, 1, x)
+    terms = [-((-1) ** k) * (k + 1) / (k + 2) for k in range(14)]
+    return value, jnp.where(
+        small, _horner(terms, near), (1 / (1 + far) - value) / far
+    ) * dx
+
+
 def _series(x: Scalar, derivative: int = 0) -> Scalar:
     """The series of the ratio, or of its derivative."""
     terms = [1 / math.factorial(k + 1) for k in range(10 + derivative)]
     for _ in range(derivative):
         terms = [k * c for k, c in enumerate(terms)][1:]
-    # Horner's rule; `jnp.polyval` would be a loop.
+    return _horner(terms, x)
+
+
+def _horner(terms: list[float], x: Scalar) -> Scalar:
+    # `jnp.polyval` would be a loop.
     value = terms[-1]
     for c in terms[-2::-1]:
         value = value * x + c

@@ -14,6 +14,7 @@ from ._kinetic import (
     RelativisticKinetic as RelativisticKinetic,
 )
 from ._lagrangian import LagrangianSystem as LagrangianSystem
+from ._mechanical import MechanicalSystem as MechanicalSystem
 from ._mirror import (
     AbstractMirrorMap as AbstractMirrorMap,
     EntropyMirror as EntropyMirror,

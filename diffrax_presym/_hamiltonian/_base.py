@@ -3,9 +3,10 @@ from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Inexact, PyTree
 
-from .._friction import AbstractDamping
+from .._friction import AbstractDamping, AbstractFriction, check_scalar
 from .._friction._base import Scalar, Time
 from .._misc import as_time, tree_scale
 from .._split import AbstractSplit
@@ -39,6 +40,21 @@ class AbstractHamiltonian(eqx.Module):
     # known.
     splits: AbstractVar[tuple[AbstractSplit, ...]]
 
+    @property
+    def friction(self) -> AbstractFriction | None:
+        """The friction in the frame of the momenta; by default that of `damping`."""
+        check_scalar(self.damping, type(self).__name__)
+        return self.damping
+
+    @property
+    def friction_table(self) -> PyTree:
+        """What `with_table` was given, or `None`."""
+        return None
+
+    def with_table(self, table: PyTree) -> "AbstractHamiltonian":
+        """The same system, whose friction uses the result of its `tabulate`."""
+        return self
+
     @abc.abstractmethod
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         """The mechanical energy $E(t, q, p)$."""
@@ -71,6 +87,12 @@ class AbstractHamiltonian(eqx.Module):
         order in `h`. Only used by splittings, if `splits` is not empty.
         """
 
+    def friction_force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
+        """The force of all friction."""
+        zero = jtu.tree_map(jnp.zeros_like, p)
+        friction = self.friction
+        return zero if friction is None else friction.net_force(t, zero, p)
+
     def potential_force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         r"""The force $-\partial V / \partial q$ of the potential part, if there is one.
 
@@ -90,7 +112,10 @@ class AbstractHamiltonian(eqx.Module):
     def log_scale(self, t: Time) -> Scalar:
         r"""The log scale $\eta(t)$; 0 for a system without damping."""
         t = as_time(t)
-        return jnp.zeros_like(t) if self.damping is None else self.damping(t)
+        if self.damping is None:
+            return jnp.zeros_like(t)
+        check_scalar(self.damping, type(self).__name__)
+        return self.damping(t)
 
     def canonical(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         r"""The value of the Hamiltonian, $e^{\eta(t)} E(t, q, p)$.

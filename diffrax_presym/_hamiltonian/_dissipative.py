@@ -3,7 +3,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from .._friction import AbstractDamping, as_damping
+from .._friction import AbstractDamping, as_damping, check_scalar
 from .._misc import scalar_fn, tree_scale
 from ._energy import (
     AbstractMechanicalHamiltonian,
@@ -26,6 +26,18 @@ class ConformalHamiltonian(AbstractMechanicalHamiltonian):
     The (generalised) conformal Hamiltonian systems, equations (gen_conf) and
     (new_ham_time) of França, Jordan and Vidal (2021), with
     $H(t, q, P) = e^{\eta(t)} E(t, q, e^{-\eta(t)} P)$. The energy may depend on time.
+
+    One rate of damping acts on all momenta; for any other friction use
+    [`diffrax_presym.MechanicalSystem`][].
+
+    !!! warning
+
+        Damping acts on the momentum $p$ of the energy, which is not always the mass
+        times the velocity. With a vector potential, $E = |p - A(q)|^2 / 2$, or in
+        general coordinates, it is not friction of the velocity, and the result depends
+        on the choice of $A$. For a charge in a magnetic field with friction use
+        [`diffrax_presym.ViscousDamping`][], for a mass matrix that depends on the
+        positions [`diffrax_presym.LagrangianSystem`][].
     """
 
     E: SeparableEnergy | GeneralEnergy
@@ -137,6 +149,7 @@ class _ScaledKinetic(AbstractKinetic):
         return self.kinetic.is_quadratic
 
     def _parts(self, t):
+        check_scalar(self.eta1, "DissipativeHamiltonian")
         eta2 = self.eta2(t)
         return jnp.exp(eta2 - self.eta1(t)), self.kinetic.rescale(eta2)
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, PyTree
 
-from .._friction import AbstractDamping
+from .._friction import AbstractDamping, AbstractFriction, is_scalar
 from .._friction._base import Scalar, Time
 from .._misc import all_finite, match, scalar_fn
 from .._split import AbstractSplit, KineticSplit, PotentialSplit, SharedSplit
@@ -90,7 +90,7 @@ class SeparableEnergy(eqx.Module):
     def velocity_and_force(self, t: Time, q: Q, p: P, args: PyTree) -> tuple[Q, P]:
         return self.velocity(t, q, p, args), self.force(t, q, p, args)
 
-    def splits(self, damping: AbstractDamping | None) -> tuple[AbstractSplit, ...]:
+    def splits(self, friction: AbstractFriction | None) -> tuple[AbstractSplit, ...]:
         kinetic = self.kinetic if self.velocity_fn is None else None
         nystrom = kinetic is not None and kinetic.is_quadratic
         kinetic_split = KineticSplit(separable=True, nystrom=nystrom)
@@ -98,14 +98,14 @@ class SeparableEnergy(eqx.Module):
         if self.force_fn is None and isinstance(self.potential, QuadraticPotential):
             splits.append(PotentialSplit())
         # Other energies quadratic in `p` may have a mass that depends on time.
-        if isinstance(kinetic, QuadraticKinetic):
-            splits.append(SharedSplit(kinetic, damping))
+        if isinstance(kinetic, QuadraticKinetic) and is_scalar(friction):
+            splits.append(SharedSplit(kinetic, friction))
         return tuple(splits)
 
-    def displacement(self, t: Time, h: Time, p: P, args: PyTree, damping, order) -> Q:
+    def displacement(self, t: Time, h: Time, p: P, args: PyTree, friction, order) -> Q:
         if self.velocity_fn is None:
-            return self.kinetic.displacement(t, h, p, args, damping, order)
-        return integrate_velocity(self._velocity, t, h, p, args, damping, order)
+            return self.kinetic.displacement(t, h, p, args, friction, order)
+        return integrate_velocity(self._velocity, t, h, p, args, friction, order)
 
     def is_valid(self, q: Q, p: P) -> None:
         return None
@@ -146,10 +146,10 @@ class GeneralEnergy(eqx.Module):
         slopes = jax.grad(self.__call__, argnums=(1, 2))(t, q, p, args)
         return slopes[1], jtu.tree_map(jnp.negative, slopes[0])
 
-    def splits(self, damping: AbstractDamping | None) -> tuple[AbstractSplit, ...]:
+    def splits(self, friction: AbstractFriction | None) -> tuple[AbstractSplit, ...]:
         return ()
 
-    def displacement(self, t: Time, h: Time, p: P, args: PyTree, damping, order) -> Q:
+    def displacement(self, t: Time, h: Time, p: P, args: PyTree, friction, order) -> Q:
         raise ValueError(
             "`Hamiltonian(energy)` has no exact drift, because it is not split into a "
             "kinetic and a potential part. Write `SeparableHamiltonian(kinetic, "
@@ -181,12 +181,12 @@ class AbstractMechanicalHamiltonian(AbstractHamiltonian):
 
     @property
     def splits(self) -> tuple[AbstractSplit, ...]:
-        return self.E.splits(self.damping)
+        return self.E.splits(self.friction)
 
     def kinetic_flow(
         self, t: Time, h: Time, q: Q, p: P, args: PyTree = None, order: int = 8
     ) -> tuple[Q, None]:
-        return self.E.displacement(t, h, p, args, self.damping, order), None
+        return self.E.displacement(t, h, p, args, self.friction, order), None
 
     def is_valid(
         self, t: Time, q: Q, p: P, args: PyTree = None

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
-from .._friction import AbstractFriction
+from .._forms import as_form, divide, multiply
+from .._friction import AbstractDamping, AbstractFriction
 from .._friction._base import Scalar, Time
 from .._friction._functions import gauss_legendre, quadrature
 from .._misc import (
@@ -22,7 +23,6 @@ from .._misc import (
     tree_scale,
     tree_sum,
 )
-from ._quadratic import as_form, divide, multiply
 
 
 class AbstractKinetic(eqx.Module):
@@ -170,6 +170,8 @@ class RelativisticKinetic(AbstractKinetic):
     def displacement(self, t, h, p, args, friction, order):
         if friction is None:
             return tree_scale(h, self.velocity(t, p, args))
+        if not (isinstance(friction, AbstractDamping) and friction.is_scalar):
+            return integrate_velocity(self.velocity, t, h, p, args, friction, order)
         p, square, rest, unit = self._scaled(p)
 
         # The momentum keeps its direction, so only a scalar has to be integrated.

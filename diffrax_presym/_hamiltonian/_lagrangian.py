@@ -5,10 +5,12 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
+import lineax as lx
 from jaxtyping import Array, Bool, Inexact, PyTree
 
+from .._forms import as_form, multiply
 from .._friction._base import Scalar, Time
-from .._misc import all_finite, as_parameter, cast_to, describe, match, scalar_fn
+from .._misc import all_finite, cast_to, describe, match, scalar_fn
 from ._base import AbstractHamiltonian
 from ._energy import check_callable
 
@@ -18,6 +20,8 @@ _Matrix = Inexact[Array, "n n"]
 
 # Up to this size a factorisation written out in full was measured faster than LAPACK.
 _SMALL = 6
+
+_FRICTION = "`LagrangianSystem(friction=...)`"
 
 
 class LagrangianSystem(AbstractHamiltonian):
@@ -67,7 +71,7 @@ class LagrangianSystem(AbstractHamiltonian):
 
     mass_fn: Callable
     potential: Callable
-    friction: Inexact[Array, "..."] | None
+    coefficients: PyTree[Inexact[Array, "..."]] | lx.AbstractLinearOperator | None
     force_fn: Callable | None
     damping = None
     splits = ()
@@ -82,8 +86,8 @@ class LagrangianSystem(AbstractHamiltonian):
             number.
         - `friction`: the coefficients `C` of the friction `-C v`, in units of force per
             velocity (torque per angular velocity for an angle): a number, an array of
-            shape `(n,)` with one for each joint, or a matrix of shape `(n, n)`.
-            Defaults to no friction.
+            shape `(n,)` with one for each joint, a matrix of shape `(n, n)` or a
+            `lineax.AbstractLinearOperator`. Defaults to no friction.
         - `force`: any further generalised force, a function `f(t, q, v, args)` of the
             velocity `v` that returns an array of shape `(n,)`: a motor, a controller,
             drag. Defaults to none.
@@ -103,11 +107,9 @@ class LagrangianSystem(AbstractHamiltonian):
                 f"but got {friction!r}. Write friction that is a function as "
                 "`force=f`, with `f(t, q, v, args)`."
             )
-        if friction is not None:
-            friction = as_parameter(friction, "`LagrangianSystem(friction=...)`")
         self.mass_fn = mass_matrix
         self.potential = potential
-        self.friction = friction
+        self.coefficients = as_form(friction, _FRICTION, positive=False)
         self.force_fn = force
 
     def mass_matrix(self, t: Time, q: _Vector, args: PyTree = None) -> _Matrix:
@@ -179,12 +181,25 @@ class LagrangianSystem(AbstractHamiltonian):
             return kinetic - self._potential(t, q, args)
 
         force = jax.grad(lagrangian)(q)
-        if self.friction is not None:
-            force = force - _viscous(self.friction, v)
+        if self.coefficients is not None:
+            force = force - multiply(self.coefficients, v, _FRICTION, "q")
         if self.force_fn is not None:
             value = self.force_fn(t, q, v, args)
             force = force + match(value, q, "`force`", "`q`")
         return v, force
+
+    @property
+    def is_conservative(self) -> bool:
+        """Whether there is neither friction nor a further force."""
+        return self.coefficients is None and self.force_fn is None
+
+    def friction_force(
+        self, t: Time, q: _Vector, p: _Vector, args: PyTree = None
+    ) -> _Vector:
+        v = self.to_velocity(t, q, p, args)
+        if self.coefficients is None:
+            return jnp.zeros_like(v)
+        return -multiply(self.coefficients, v, _FRICTION, "q")
 
     def _potential(self, t, q, args):
         return cast_to(scalar_fn(self.potential, "The potential")(t, q, args), q)
@@ -204,16 +219,6 @@ class LagrangianSystem(AbstractHamiltonian):
             "A `LagrangianSystem` has no exact drift, because its mass matrix depends "
             "on the positions. Use `PresymplecticGauss()`, which needs none."
         )
-
-
-def _viscous(C: Inexact[Array, "..."], v: _Vector) -> _Vector:
-    C, n = cast_to(C, v), len(v)
-    if C.shape not in ((), (n,), (n, n)):
-        raise ValueError(
-            f"`friction` must be a number, an array of shape ({n},) or a matrix of "
-            f"shape ({n}, {n}) for {n} joints, but has shape {C.shape}."
-        )
-    return C @ v if C.ndim == 2 else C * v
 
 
 def _solve_positive(M: _Matrix, p: _Vector) -> _Vector:

@@ -2,9 +2,9 @@ import equinox as eqx
 import lineax as lx
 from jaxtyping import Array, Inexact, PyTree
 
+from .._forms import as_form, multiply
 from .._friction._base import Scalar, Time
 from .._misc import tree_dot
-from ._quadratic import as_form, multiply
 
 
 _STIFFNESS = "`QuadraticPotential(stiffness)`"

@@ -1,11 +1,13 @@
 import abc
 import bisect
 from functools import partial
-from typing import ClassVar, Generic, TYPE_CHECKING, TypeVar
+from typing import ClassVar, Generic, NamedTuple, TYPE_CHECKING, TypeVar
 
 import diffrax as dfx
 import jax.lax as lax
+import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, PyTree
 
 from .._interpolation import HermiteInterpolation, inner_points
@@ -22,6 +24,7 @@ from ._engine import (
     Result,
     Span,
     Stage,
+    time_lengths,
 )
 from ._estimate import no_error_estimate
 
@@ -37,6 +40,18 @@ _Carry = TypeVar("_Carry")
 
 # Points within a step that dense output uses, from the order up to which they suffice.
 _ORDERS, _INNER_POINTS = (2, 4, 10), (0, 1, 3, 5)
+
+
+class Tabulated(NamedTuple):
+    """A solver state, and what friction computes once for steps of one length."""
+
+    carry: PyTree
+    table: PyTree
+
+
+def signed(lengths: np.ndarray) -> np.ndarray:
+    """Lengths forwards and backwards in time, in order."""
+    return np.unique(np.concatenate([-lengths, lengths]))
 
 
 class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
@@ -113,15 +128,48 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
             "distance between them. Use `PresymplecticCoupled()`, for example."
         )
 
+    def lengths(self, system: System) -> np.ndarray:
+        """The lengths of the stages over which friction acts, in units of the step."""
+        return time_lengths(self.moves(system))
+
     def init(self, terms, t0, t1, y0, args) -> _Carry:
         system = as_system(terms, args)
         check_state(y0)
-        return self.start(system, system.time(t0), y0)
+        t0, t1 = system.time(t0), system.time(t1)
+        carry = self.start(system, t0, y0)
+        if system.friction is None or not system.friction.has_table(y0[1]):
+            return carry
+        h = self.step_length(t0, t1)
+        system = self.tabulated(system, h, y0)
+        return Tabulated(carry, system.table)  # pyright: ignore[reportReturnType]
+
+    def tabulated(self, system: System, h: Array, y: State) -> System:
+        """The system, with what friction computes once for a step of this length."""
+        if system.friction is None:
+            return system
+        times = cast_to(signed(self.lengths(system)), h) * h
+        return system.with_table(system.friction.tabulate(y[1], times))
+
+    def fitted(self, system: System, t: Array, h: Array, y: State) -> System:
+        """The same if the system has a table already, of a step of any length."""
+        table = system.table
+        if table is None:
+            return system
+        lengths = signed(self.lengths(system))
+        times = cast_to(lengths, h) * h
+        # Neighbours must not be mistaken for each other.
+        gap = np.min(np.diff(lengths), initial=1.0) / np.max(lengths, initial=1.0)
+        eps = jnp.finfo(h.dtype).eps
+        rounding = jnp.minimum(4 * eps * jnp.abs(t), float(gap) / 8 * jnp.abs(h))
+        fits = jnp.all(jnp.abs(times - table.times) <= rounding + 4 * eps * jnp.abs(h))
+        table, compute = table.assume(True), lambda: self.tabulated(system, h, y).table
+        return system.with_table(lax.cond(fits, lambda: table, compute))
 
     def attempt(
         self, system: System, t0: Array, t1: Array, h: Array, y: State, carry: _Carry
     ) -> tuple[State, _Carry, Result]:
         """One step, with a failure if its end is invalid."""
+        system = self.fitted(system, t1, h, y)
         y, carry, result = self.advance(system, t0, t1, h, y, carry)
         return y, carry, first_failure(result, system.check(t1, y))
 
@@ -137,10 +185,23 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
 
         By default a shorter step of the scheme from the start of the step.
         """
-        return self.advance(system, t0, t, self.step_length(t0, t), *start)[0]
+        h = self.step_length(t0, t)
+        if system.table is not None:
+            system = self.tabulated(system, h, start[0])
+        return self.advance(system, t0, t, h, *start)[0]
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         system = as_system(terms, args)
+        if not isinstance(solver_state, Tabulated):
+            return self._step(system, t0, t1, y0, solver_state, made_jump)
+        carry, table = solver_state
+        times = system.time(t0), system.time(t1)
+        h = self.step_length(*times)
+        system = self.fitted(system.with_table(table), times[1], h, y0)
+        *outputs, carry, result = self._step(system, t0, t1, y0, carry, made_jump)
+        return *outputs, Tabulated(carry, system.table), result
+
+    def _step(self, system: System, t0, t1, y0, solver_state, made_jump):
         t0, t1 = system.time(t0), system.time(t1)
         carry = solver_state
         # After a jump the solver state is stale. Mostly `made_jump` is the Python bool

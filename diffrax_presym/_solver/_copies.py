@@ -6,11 +6,14 @@ within a step is `y, (copy, field)`, with the velocity and force of the last exc
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
+import diffrax as dfx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from .._misc import tree_add, tree_scale
+from .._misc import largest, tree_add, tree_scale
 from .._split import State
 from .._system import System
 from ._engine import Move, Outcome, Span, Stage
@@ -81,6 +84,28 @@ def separate(rotated: Callable[[Array, State], State]) -> Move:
         return (system.add(y, -1, half), rotated(span.h, half)), None
 
     return Move(apart, join)
+
+
+def _check_distance(system: System, span: Span, stage: Stage) -> Outcome:
+    # Once the copies are as far from each other as they are large, they are separate
+    # trajectories, and their mean is none. Rounding may be larger than what is at rest.
+    y, half = stage
+    sizes = [largest(x) for x in system.values(y)]
+    distances = [2 * largest(x) for x in half]
+    with jax.numpy_dtype_promotion("standard"):
+        eps = max(float(jnp.finfo(x.dtype).eps) for x in sizes)
+        rounding = eps ** (1 / 3) * jnp.maximum(*sizes)
+        pairs = zip(sizes, distances, strict=True)
+        q, p = (d > jnp.maximum(size, rounding) for size, d in pairs)
+    failure: Any = dfx.RESULTS.nonlinear_divergence
+    return stage, dfx.RESULTS.where(q | p, failure, dfx.RESULTS.successful)
+
+
+def _keep(system: System, span: Span, stage: Stage) -> Outcome:
+    return stage, None
+
+
+check_distance = Move(_check_distance, _keep)
 
 
 def rotate(angle: Array, y: State, scale: ArrayLike = 1.0) -> State:

@@ -10,8 +10,8 @@ from .._split import State
 from .._system import System
 from ._base import AbstractMoveSolver, AbstractPresymplecticSolver
 from ._composition import rows
-from ._copies import exchange, move_frames, rotate, separate
-from ._engine import forward, Moves, Span, Stages
+from ._copies import check_distance, exchange, move_frames, rotate, separate
+from ._engine import forward, Moves, Result, Span, Stages
 from ._tableaus import (
     SOFRONIOU_SPALETTA_6,
     SOFRONIOU_SPALETTA_8,
@@ -45,8 +45,8 @@ def _free_step(order: int, rotated: Callable[[Array, State], State]) -> Stages:
     table = [(0, 0, 0.5), (0, 0.5, 0.5), (0.5, 0.5, 1), (0.5, 1, 0.5), (1, 1, 0.5)]
     stages = Stages([Stages(moves, table)], rows(_WEIGHTS[order]))
     apart = separate(rotated)
-    moves = apart, stages, apart.inverse
-    return Stages(moves, [(0, 0, 1), (0, 1, 1), (1, 1, 1)])
+    moves = apart, stages, apart.inverse, check_distance
+    return Stages(moves, [(0, 0, 1), (0, 1, 1), (1, 1, 1), (1, 1, 1)])
 
 
 def _check_order(order, name: str) -> int:
@@ -71,7 +71,10 @@ class PresymplecticCoupled(AbstractMoveSolver[State]):
     of a step. Then their difference, of the order of the local error, is rotated by a
     fixed angle, so that it does not accumulate. The solution is their mean, which
     depends on the difference only in second order. There is no strength to choose, and
-    no order is lost. The `solver_state` holds half of the difference.
+    no order is lost. The `solver_state` holds half of the difference. A solve fails,
+    with `RESULTS.nonlinear_divergence`, if the copies differ by more than their size:
+    the coupling is not stable with strong friction that is part of the force. Then use
+    shorter steps or [`diffrax_presym.PresymplecticGauss`][].
     """
 
     composed_order: int = eqx.field(static=True)
@@ -193,8 +196,9 @@ class PresymplecticProjected(AbstractPresymplecticSolver[None]):
 
     def advance(
         self, system: System, t0: Array, t1: Array, h: Array, y: State, carry: None
-    ) -> tuple[State, None, None]:
+    ) -> tuple[State, None, Result]:
         # The difference of the copies is dropped, so the step is not invertible.
         moves = _free_step(self.composed_order, lambda h, half: half)
-        (y, _), _ = forward(moves, system, Span(t0, t1, h), (y, system.zeros(y)))
-        return y, None, None
+        stage = y, system.zeros(y)
+        (y, _), result = forward(moves, system, Span(t0, t1, h), stage)
+        return y, None, result

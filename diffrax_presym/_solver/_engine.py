@@ -91,6 +91,21 @@ class Stages:
 Moves: TypeAlias = Move | Stages
 
 
+def time_lengths(moves: Moves) -> np.ndarray:
+    """The distinct lengths of the moves that advance time, in units of the step."""
+
+    def each(moves: Moves):
+        if isinstance(moves, Stages):
+            for row in moves.table:
+                for move, (start, end, length) in zip(moves.moves, row, strict=True):
+                    if start != end:
+                        yield from (length * x for x in each(move))
+        else:
+            yield 1.0
+
+    return np.unique(np.round(np.abs(list(each(moves))), 15))
+
+
 def forward(moves: Moves, system: System, span: Span, stage: Stage) -> Outcome:
     """Apply all moves, in order."""
     return _walk(lambda move, *at: move.do(system, *at), moves, span, stage)

@@ -1,4 +1,5 @@
 import equinox as eqx
+import numpy as np
 import optimistix as optx
 
 from .._misc import check_root_finder, tree_scale
@@ -44,6 +45,9 @@ class PresymplecticMidpoint(AbstractMoveSolver[None]):
 
     def order(self, terms) -> int:
         return 2
+
+    def lengths(self, system: System) -> np.ndarray:
+        return np.array([0.5])
 
     def moves(self, system: System) -> Moves:
         find = root_find(self.root_finder, self.root_find_max_steps)

@@ -58,17 +58,25 @@ def _known_kick(system: System, span: Span, stage: Stage) -> Outcome:
     return _kicked(system, span, stage, force=stage[1])
 
 
-def kick(kind: str, known: bool = False) -> Move:
+def kick(kind: str, order: int, known: bool = False) -> Move:
     """The flow of the other part of a split, at fixed time.
 
     If `known`, the force is that of the last kick.
     """
 
+    def by(force, system: System, span: Span, stage: Stage) -> Outcome:
+        z, carry = stage
+        z = _split(system, kind).kick(system, span.t0, span.h, z, force, order)
+        return (z, None if carry is None else force), None
+
+    def same(system: System, span: Span, stage: Stage) -> Outcome:
+        return by(stage[1], system, span, stage)
+
     def move(system: System, span: Span, stage: Stage) -> Outcome:
         force = _split(system, kind).force(system, span.t0, stage[0])
-        return _kicked(system, span, stage, force)
+        return by(force, system, span, stage)
 
-    return Move(_known_kick if known else move, move)
+    return Move(same if known else move, move)
 
 
 # The moves of the paper, with forces and velocities frozen at one end. For nonseparable

@@ -59,7 +59,8 @@ class AbstractSplitting(AbstractMoveSolver[PyTree]):
             return split
         if self.kind == "shared":
             raise ValueError(
-                f"`{name}` needs a known mass that does not depend on time. Write "
+                f"`{name}` needs a known mass that does not depend on time, and one "
+                "rate of friction for all momenta. Write "
                 "`ConformalHamiltonian(QuadraticKinetic(mass), potential, damping)` or "
                 "`SeparableHamiltonian(QuadraticKinetic(mass), potential)`. Otherwise "
                 "use `TunedRKN6()` or `BlanesMoan6()`."
@@ -70,12 +71,14 @@ class AbstractSplitting(AbstractMoveSolver[PyTree]):
                 f"potential, but this `{system.name}` is not. "
                 "If it is a sum of the two, give its parts: `SeparableHamiltonian("
                 "kinetic, potential)` or `ConformalHamiltonian(kinetic, potential, "
-                "damping)`. Otherwise use `PresymplecticCoupled()`."
+                "damping)`. Otherwise use `PresymplecticCoupled()`, or with a force "
+                "that depends on the velocity `PresymplecticGauss()`."
             )
         raise ValueError(
             f"`{name}` keeps its order only for a quadratic kinetic energy, written as "
             "`QuadraticKinetic(mass)`, or a quadratic potential, written as "
-            "`QuadraticPotential(stiffness)`. Otherwise use `BlanesMoan4()` or "
+            "`QuadraticPotential(stiffness)`; and for friction that depends neither on "
+            "positions nor on the speed. Otherwise use `BlanesMoan4()` or "
             "`BlanesMoan6()`."
         )
 
@@ -96,9 +99,9 @@ class AbstractSplitting(AbstractMoveSolver[PyTree]):
         ends = drifts[: len(pairs), 1]
         table = np.stack([ends, ends, pairs], axis=-1)
         table = np.stack([drifts[: len(pairs)], table], axis=1)
-        stages = Stages([flow, kick(kind)], table)
+        stages = Stages([flow, kick(kind, tableau.order)], table)
         if tableau.kick_first:
-            moves = enter, kick(kind, known=True), stages, enter.inverse
+            moves = enter, kick(kind, tableau.order, known=True), stages, enter.inverse
             spans = [(0, 0, 0), (0, 0, kicks[0]), (0, 1, 1), (1, 1, 0)]
         else:
             moves = enter, stages, flow, enter.inverse

@@ -6,7 +6,10 @@ from ._measures import (
     copy_distance as copy_distance,
     energy as energy,
     energy_error as energy_error,
+    energy_lost as energy_lost,
+    power_lost as power_lost,
     structure_defect as structure_defect,
+    volume_defect as volume_defect,
 )
 from ._work_precision import (
     work_precision as work_precision,

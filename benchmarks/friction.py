@@ -1,0 +1,384 @@
+"""Friction of every kind: time and force evaluations of a solve against its error.
+
+Six systems whose friction is not one rate for all momenta, with the solvers of this
+package and those of Diffrax, adaptive and with constant steps. `best ours / theirs` are
+ratios of the least of any solver, by time and by evaluations; `schemes` are those that
+reach it. A dash is an error that none of the runs reached. The last table compares with
+MuJoCo, where it is installed.
+"""
+
+import dataclasses
+import math
+from functools import partial
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from _report import command_line, Table
+from _schemes import DIFFRAX, SCHEMES
+from _solve import final_state, last, reference, relative_error, solve
+from _timing import error_curves, interleaved, time_to
+
+import diffrax_presym as dps
+
+
+jax.config.update("jax_enable_x64", True)
+
+TARGETS = (1e-3, 1e-6, 1e-9)
+# For friction by place or by speed, and for any linear friction.
+GENERAL = "Strang", "BlanesMoan4", "BlanesMoan6", "SofroniouSpaletta8, Strang"
+NYSTROM = "PresymplecticLeapfrog", "BlanesMoanRKN4", "TunedRKN6", "BlanesCasasRKN8"
+STRANG_8 = SCHEMES["SofroniouSpaletta8"]._replace(
+    solver=dps.SofroniouSpaletta8(dps.Strang())
+)
+OURS = SCHEMES | {"SofroniouSpaletta8, Strang": STRANG_8}
+
+
+@dataclasses.dataclass(frozen=True)
+class System:
+    name: str
+    system: dps.AbstractHamiltonian
+    y0: Any
+    t1: float
+    schemes: tuple[str, ...]
+    fastest: float  # the shortest period of the motion
+
+
+def chain():
+    """Ten pendulums with springs between them, unit inertia, and a damper at each."""
+    dampers = jnp.linspace(0.05, 0.5, 10)
+
+    def potential(t, q, args):
+        return 2 * jnp.sum((q[1:] - q[:-1]) ** 2) - jnp.sum(jnp.cos(q))
+
+    system = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), potential, dps.ViscousDamping(dampers)
+    )
+    y0 = jnp.linspace(1.5, -0.5, 10), jnp.zeros(10)
+    return System("chain of 10", system, y0, 20.0, NYSTROM, 1.5)
+
+
+def network():
+    """200 masses and random springs that stiffen, with Rayleigh damping."""
+    rng, n = np.random.default_rng(0), 200
+    i, j = (rng.integers(0, n, 600) for _ in range(2))
+    strength = rng.uniform(0.5, 1.5, 600) * (i != j)
+    stiffness = np.eye(n)
+    for a, b, k in zip(i, j, strength, strict=True):
+        stiffness[[a, b], [a, b]] += k
+        stiffness[[a, b], [b, a]] -= k
+    stiffness = jnp.asarray(stiffness)
+
+    def potential(t, q, args):
+        return q @ (stiffness @ q) / 2 + jnp.sum(q**4) / 4
+
+    friction = dps.RayleighDamping(0.05, 0.02, stiffness)
+    masses = jnp.asarray(rng.uniform(0.5, 2, n))
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(masses), potential, friction)
+    y0 = jnp.asarray(rng.normal(size=n)), jnp.zeros(n)
+    return System("network of 200", system, y0, 20.0, NYSTROM, 1.2)
+
+
+def wave():
+    """The wave equation on 512 points, with a layer at either end that absorbs."""
+    n = 512
+    x = jnp.linspace(0, 1, n)
+    layer = 40 * (jnp.maximum(0.2 - x, 0) ** 2 + jnp.maximum(x - 0.8, 0) ** 2) / 0.04
+    speed = float(n)
+
+    def potential(t, q, args):
+        return speed**2 * (jnp.sum(jnp.diff(q) ** 2) + q[0] ** 2 + q[-1] ** 2) / 2
+
+    system = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), potential, dps.ConstantDamping(layer)
+    )
+    y0 = jnp.exp(-(((x - 0.4) / 0.03) ** 2)), jnp.zeros(n)
+    return System("wave equation", system, y0, 1.0, NYSTROM, math.pi / speed)
+
+
+def charge():
+    """A charged particle in a field, a trap that is not harmonic, and friction."""
+    field = 3 * jnp.array([[0.0, -1.0, 0.2], [1.0, 0.0, -0.4], [-0.2, 0.4, 0.0]])
+
+    def potential(t, q, args):
+        return jnp.sum(q**4) / 4 + q[0] ** 2 * q[1] / 2
+
+    friction = dps.ViscousDamping(field + 0.05 * jnp.eye(3))
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), potential, friction)
+    y0 = jnp.array([1.0, 0.3, -0.5]), jnp.array([0.0, 0.7, 0.2])
+    return System("charged particle", system, y0, 50.0, NYSTROM, 2.0)
+
+
+def projectiles():
+    """100 balls with quadratic drag and weight, on a trampoline."""
+    rng, n = np.random.default_rng(0), 100
+    masses = jnp.asarray(rng.uniform(0.5, 2, (n, 1)))
+
+    def potential(t, q, args):
+        height = q[:, 2:]
+        bounce = jnp.logaddexp(0.0, -4 * height) ** 2 / 16 * 20
+        return jnp.sum(masses * 9.81 * height + masses * bounce)
+
+    drag = dps.Drag(jnp.asarray(rng.uniform(0.02, 0.1, (n, 1))))
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(masses), potential, drag)
+    q0 = jnp.asarray(rng.uniform(0, 1, (n, 3)))
+    p0 = masses * jnp.asarray(rng.normal(size=(n, 3)) * 5 + [0, 0, 10])
+    return System("projectiles", system, (q0, p0), 5.0, GENERAL, 1.5)
+
+
+def planet():
+    """A planet in gas whose density depends on the radius."""
+
+    def potential(t, q, args):
+        return -1 / jnp.linalg.norm(q)
+
+    def rate(t, q, args):
+        return 0.01 * jnp.exp(-4 * (jnp.linalg.norm(q) - 1))
+
+    system = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), potential, dps.PositionDamping(rate)
+    )
+    y0 = jnp.array([1.1, 0.0, 0.0]), jnp.array([0.0, 0.9, 0.1])
+    return System("planet in gas", system, y0, 50.0, GENERAL, 4.0)
+
+
+SYSTEMS = (chain, network, wave, charge, projectiles, planet)
+ADAPTIVE = 10.0 ** -np.arange(2.0, 14.0)
+
+
+def exact_solution(problem):
+    if problem.name != "wave equation":
+        times = jnp.array([0.0, problem.t1])
+        found = reference(problem.system, problem.y0, times)
+        return jax.tree.map(lambda y: y[-1], found)
+    # A linear system has a solution by matrix exponential.
+    import scipy.linalg
+
+    n = len(problem.y0[0])
+    speed = float(n)
+    K = speed**2 * (2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
+    rates = np.asarray(problem.system.laws[0].gamma)
+    matrix = np.block([[np.zeros((n, n)), np.eye(n)], [-K, -np.diag(rates)]])
+    y = scipy.linalg.expm(matrix * problem.t1) @ np.concatenate(problem.y0)
+    return np.split(y, 2)
+
+
+def work(problem, quick):
+    """For every solver its points `(error, seconds)` and `(error, evaluations)`."""
+    times = jnp.array([0.0, problem.t1])
+    run_one = eqx.filter_jit(final_state)
+    exact = exact_solution(problem)
+    runs, evaluations = {}, {}
+
+    def add(name, solver, cost, sweep, adaptive=False):
+        sweep = [jnp.asarray(float(x)) for x in sweep]
+        run = partial(run_one, problem.system, solver, times, problem.y0)
+        runs[name] = partial(run, adaptive=adaptive), sweep
+        evaluations[name] = [cost * float(x) for x in sweep]
+
+    periods = problem.t1 / problem.fastest
+    points, most = (5, 100) if quick else (14, 1200)
+    for name in problem.schemes:
+        solver, _, cost = OURS[name]
+        per_period = np.geomspace(2, most, points) * (1 + (cost == 1))
+        add(name, solver, cost, np.unique(np.ceil(periods * per_period / cost)))
+    tolerances = ADAPTIVE[:: 3 if quick else 1]
+    for name, (solver, _, cost) in DIFFRAX.items():
+        add(name, type(solver)(scan_kind="lax"), cost, tolerances, True)
+        per_period = np.geomspace(10, most, points)
+        steps = np.unique(np.ceil(periods * per_period / cost))
+        add(name + ", constant", solver, cost, steps)
+        evaluations[name] = [
+            cost * _adaptive_steps(problem, solver, tol) for tol in tolerances
+        ]
+    curves, costs = {}, {}
+    error = lambda y: relative_error(y, exact)
+    timed = error_curves(runs, error, 2 if quick else 5)
+    for name, curve in timed.items():
+        curves[name] = curve
+        found = [float(error(runs[name][0](x))) for x in runs[name][1]]
+        pairs = zip(found, evaluations[name], strict=True)
+        costs[name] = [pair for pair in pairs if math.isfinite(pair[0])]
+    return curves, costs
+
+
+def _adaptive_steps(problem, solver, tolerance):
+    controller = dfx.PIDController(rtol=tolerance, atol=tolerance)
+    sol = _count(problem.system, solver, problem.t1, problem.y0, controller)
+    return int(sol)
+
+
+@eqx.filter_jit
+def _count(system, solver, t1, y0, controller):
+    return solve(system, solver, 0.0, t1, None, y0, None, controller).stats["num_steps"]
+
+
+def compare(curves, ours):
+    """For each target the least of ours, the least of Diffrax's, and their ratio."""
+    out = []
+    for target in TARGETS:
+        best = {}
+        for name, curve in curves.items():
+            side = name in ours
+            cost = time_to(curve, target)
+            if cost < best.get(side, (math.inf, ""))[0]:
+                best[side] = cost, name
+        both = best.get(True), best.get(False)
+        ratio = both[1][0] / both[0][0] if both[0] and both[1] else None
+        out.append((*both, ratio))
+    return out
+
+
+def main():
+    parser = command_line(__doc__)
+    parser.add_argument("--only", nargs="*", help="names of systems")
+    options = parser.parse_args()
+    means: dict[str, list] = {"time": [], "evaluations": []}
+    table = Table(
+        "Least of Diffrax over least of ours, at errors of 1e-3, 1e-6, 1e-9",
+        *("system:<17", "by:<11"),
+        *(f"{target:.0e}:>6.1f" for target in TARGETS),
+        *("ours:<32", "Diffrax's:<30"),
+    )
+    for make in SYSTEMS:
+        problem = make()
+        if options.only and problem.name.split()[0] not in options.only:
+            continue
+        found = work(problem, options.quick)
+        for kind, curves in zip(means, found, strict=True):
+            rows = compare(curves, problem.schemes)
+            means[kind].append([ratio for *_, ratio in rows])
+            ours, theirs = (_names([row[i] for row in rows]) for i in (0, 1))
+            ratios = (ratio for *_, ratio in rows)
+            table.row(problem.name, kind, *ratios, ours, theirs)
+    for kind, rows in means.items():
+        columns = list(zip(*rows, strict=True))
+        known = [[x for x in column if x is not None] for column in columns]
+        values = (float(np.exp(np.mean(np.log(x)))) if x else None for x in known)
+        table.row("geometric mean", kind, *values, "", "")
+    if not options.only:
+        mujoco_tables(options.quick)
+
+
+def _names(best):
+    names = [x[1] if x else "-" for x in best]
+    return " ".join(_SHORT.get(name, name) for name in names)
+
+
+_SHORT = {
+    "PresymplecticLeapfrog": "Leapfrog",
+    "SofroniouSpaletta8, Strang": "SS8",
+    "BlanesMoanRKN4": "RKN4",
+    "TunedRKN6": "RKN6",
+    "BlanesCasasRKN8": "RKN8",
+    "BlanesMoan4": "BM4",
+    "BlanesMoan6": "BM6",
+}
+
+
+# MuJoCo, in C: the same system, its error and its time per simulated second.
+
+HINGE = """<mujoco><option gravity="0 0 -9.81"><flag contact="disable"/></option>
+<worldbody><body pos="0 0 2"><joint name="j0" type="hinge" axis="0 1 0" damping="0.1"/>
+<geom type="sphere" size="0.001" pos="0 0 -1" mass="1" contype="0" conaffinity="0"/>
+<inertial pos="0 0 -1" mass="1" diaginertia="1e-9 1e-9 1e-9"/></body></worldbody>
+</mujoco>"""
+
+
+def slides(n):
+    """Bodies on a line, each with a spring and a damper to the world and its parent.
+
+    The joints are relative, so the mass matrix is dense, and constant.
+    """
+    text = '<mujoco><option gravity="0 0 0"/><worldbody>'
+    for i in range(n):
+        text += (
+            f'<body><joint name="j{i}" type="slide" axis="1 0 0" stiffness="20" '
+            f'damping="{0.1 + 0.1 * i:.3f}"/><inertial pos="0 0 0" mass="1" '
+            'diaginertia="1 1 1"/>'
+        )
+    return text + "</body>" * n + "</worldbody></mujoco>"
+
+
+def mujoco_problems():
+    hinge = dps.MechanicalSystem(
+        dps.QuadraticKinetic(1.0 + 1e-9),
+        lambda t, q, args: -9.81 * jnp.sum(jnp.cos(q)),
+        dps.ViscousDamping(0.1),
+    )
+    n = 8
+    order = np.arange(n)
+    mass = jnp.asarray(n - np.maximum.outer(order, order), float)
+    chain = dps.MechanicalSystem(
+        dps.QuadraticKinetic(mass),
+        dps.QuadraticPotential(20.0),
+        dps.ViscousDamping(0.1 + 0.1 * jnp.arange(n)),
+    )
+    q0 = jnp.linspace(0.3, -0.2, n)
+    return {
+        "one hinge": (HINGE, hinge, (jnp.array([2.0]), jnp.zeros(1)), 20.0),
+        "8 slide joints": (slides(n), chain, (q0, jnp.zeros(n)), 20.0),
+    }
+
+
+@eqx.filter_jit
+def _end(system, t1, y0, solver, dt0):
+    return last(solve(system, solver, 0.0, t1, dt0, y0))
+
+
+def mujoco_tables(quick):
+    try:
+        import mujoco  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        print("\nMuJoCo is not installed: pip install mujoco")
+        return
+    kinds = mujoco.mjtIntegrator
+    integrators = {
+        "Euler": kinds.mjINT_EULER,
+        "implicitfast": kinds.mjINT_IMPLICITFAST,
+        "RK4": kinds.mjINT_RK4,
+    }
+    for name, (xml, system, (q0, p0), t1) in mujoco_problems().items():
+
+        def simulate(integrator, steps, xml=xml, q0=q0, t1=t1):
+            model = mujoco.MjModel.from_xml_string(xml)
+            model.opt.integrator, model.opt.timestep = integrator, t1 / steps
+            data = mujoco.MjData(model)
+            data.qpos[:] = q0
+            mujoco.mj_step(model, data, nstep=steps)
+            return data.qpos.copy(), data.qvel.copy()
+
+        exact = simulate(kinds.mjINT_RK4, 40_000 if quick else 200_000)
+        size = max(np.max(np.abs(x)) for x in exact)
+
+        def error(found, exact=exact, size=size):
+            pairs = zip(found, exact, strict=True)
+            return max(np.max(np.abs(x - y)) for x, y in pairs) / size
+
+        table = Table(
+            f"MuJoCo, {name}, to t = {t1}",
+            *("integrator:<24", "steps:>7", "error:>9.1e", "milliseconds:>13.3f"),
+        )
+        calls, errors = {}, {}
+        for label, kind in integrators.items():
+            for steps in (1000, 4000, 16000):
+                calls[f"MuJoCo {label}", steps] = partial(simulate, kind, steps)
+        run = partial(_end, system, t1, (q0, p0))
+        for label in ("PresymplecticLeapfrog", "BlanesMoanRKN4", "TunedRKN6"):
+            for steps in (50, 200, 800):
+                calls[label, steps] = partial(run, SCHEMES[label].solver, t1 / steps)
+        timings = interleaved(calls, 3 if quick else 9)
+        for (label, steps), timing in timings.items():
+            found = timing.result
+            if not label.startswith("MuJoCo"):
+                found = found[0], system.velocity(0.0, *found)
+            errors[label, steps] = error([np.asarray(x) for x in found])
+            milliseconds = 1e3 * timing.median
+            table.row(label, str(steps), errors[label, steps], milliseconds)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,165 @@
+"""Friction that depends on the speed."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Inexact, PyTree
+
+from .._forms import fit_form, is_operator
+from .._misc import as_parameter, cast_to
+from ._base import Numbers, Scalar, Time
+from ._damping import as_numbers
+from ._functions import expm1, expm1_ratio, log1p_ratio
+
+
+_COEFFICIENT = "`Drag(coefficient)`"
+_FOR_BODIES = (
+    "Drag acts on bodies, whose velocities are the last axis of `p`: for `n` bodies in "
+    "three dimensions use states of shape `(n, 3)`, for `n` bodies on a line `(n, 1)`."
+)
+
+
+class Drag(eqx.Module):
+    r"""Drag $-c \, |v|^{k-1} \, v$ of each body, where $|v|$ is its speed: air drag
+    ($k = 2$), Stokes drag ($k = 1$), or any power from 1 on.
+
+    For [`diffrax_presym.MechanicalSystem`][], with
+    [`diffrax_presym.QuadraticKinetic`][] and one mass for each body. Bodies are the
+    vectors over the last axis of `p`. Without a force a body keeps its direction, and
+    its speed and distance have a closed form, which is part of the drift.
+    [`diffrax_presym.Strang`][], [`diffrax_presym.BlanesMoan4`][] and
+    [`diffrax_presym.BlanesMoan6`][] keep their order;
+    Runge--Kutta--Nyström splittings would not, and refuse it. No structure is kept but
+    the symmetry.
+
+    If the coefficient depends on place the drag is part of the kicks. There, and where
+    other friction is added, its flow is a symmetric composition, of the order of the
+    scheme, of flows that are known, without further evaluations of the force.
+
+    Schemes of order above 2 have stages backwards in time, during which drag
+    accelerates. A solve fails if the momentum that a body loses over such a stage
+    exceeds what it has left; take shorter steps.
+    """
+
+    coefficient: Numbers | Callable
+    exponent: Scalar
+
+    def __init__(self, coefficient, exponent: ArrayLike = 2.0):
+        r"""**Arguments:**
+
+        - `coefficient`: $c$, in units of force per velocity to the power $k$: a number;
+            an array with as many dimensions as `p` and a last axis of length 1, one for
+            each body; a pytree of the structure of `p` of these; or a function
+            `c(t, q, args)` that returns one of these. Of any sign; negative
+            accelerates.
+        - `exponent`: the power $k$ of the speed, a number of at least 1. Defaults to 2.
+
+        **Raises:**
+
+        `ValueError` if the exponent is known to be less than 1, or a coefficient is not
+        a finite real number; and when the solve is traced, if a shape does not fit
+        bodies over the last axis of `p`, or the masses are not known.
+        """
+        if not callable(coefficient):
+            coefficient = as_numbers(coefficient, _COEFFICIENT)
+        exponent = as_parameter(exponent, "`Drag(..., exponent)`")
+        valid = isinstance(exponent, Tracer) or bool(np.all(np.asarray(exponent) >= 1))
+        if not valid or (jnp.ndim(exponent) and not isinstance(exponent, Tracer)):
+            raise ValueError(
+                "`Drag(..., exponent)` must be a number of at least 1, the power of "
+                f"the speed in the force, but got {exponent}. A smaller power "
+                "stops a body in finite time; write it as "
+                "`MechanicalSystem(..., force=f)` and make it smooth at rest."
+            )
+        self.coefficient = coefficient
+        self.exponent = exponent
+
+    @property
+    def is_local(self) -> bool:
+        """Whether the coefficient depends on place."""
+        return callable(self.coefficient)
+
+    def of(self, coefficient: Numbers) -> "Drag":
+        """The drag with another coefficient."""
+        return eqx.tree_at(lambda x: x.coefficient, self, coefficient)
+
+    def force(self, p: PyTree, mass: PyTree) -> PyTree:
+        """The force on momenta `p` of bodies of these masses."""
+        return self._each(p, mass, self._force)
+
+    def flow(self, h: Time, p: PyTree, mass: PyTree) -> tuple[PyTree, PyTree]:
+        """The displacements, and the changes of `p`, over a time `h` of motion by drag
+        alone."""
+        return self._each(p, mass, lambda *x: self._flow(h, *x), 2)
+
+    def _each(self, p: PyTree, mass: PyTree, fn: Callable, outputs: int = 1):
+        leaves, structure = jtu.tree_flatten(p)
+        each = lambda form, name: jtu.tree_leaves(_per_body(form, p, name))
+        coefficients = each(self.coefficient, _COEFFICIENT)
+        masses = each(mass, "`QuadraticKinetic(mass)`")
+        out = [fn(*x) for x in zip(leaves, masses, coefficients, strict=True)]
+        if outputs == 1:
+            return structure.unflatten(out)
+        return tuple(structure.unflatten(x) for x in zip(*out, strict=True))
+
+    def _force(self, p: Array, mass: Array, c: Array) -> Array:
+        v = p / mass
+        return -c * _power_of_speed(v, cast_to(self.exponent, p) - 1) * v
+
+    def _flow(self, h: Time, p: Array, mass: Array, c: Array) -> tuple[Array, Array]:
+        # The speed decays like (1 + (k - 1) x)^(-1 / (k - 1)), with x the time in units
+        # of that in which it would be lost at its initial rate.
+        k, h, v = cast_to(self.exponent, p), cast_to(h, p), p / mass
+        x = c / mass * _power_of_speed(v, k - 1) * h
+        ratio = log1p_ratio((k - 1) * x)
+        lost = x * ratio  # logarithm of the ratio of the speeds
+        distance = ratio * expm1_ratio((k - 2) * lost)
+        return h * distance * v, expm1(-lost) * p
+
+
+def _per_body(form, p: PyTree, name: str) -> PyTree:
+    if is_operator(form):
+        raise ValueError(f"{name} is an operator, but drag needs a mass for each body.")
+
+    def check(x, form):
+        shape = jnp.shape(x)
+        wanted = (*shape[:-1], 1)
+        if not shape:
+            raise ValueError(f"{_FOR_BODIES} This `p` is a scalar; use shape `(1,)`.")
+        if jnp.ndim(form) > len(shape) or (jnp.ndim(form) and form.shape[-1] != 1):
+            raise ValueError(
+                f"{name} of shape {form.shape} differs within a body, for `p` of shape "
+                f"{shape}. {_FOR_BODIES} Pass a number, or an array that broadcasts to "
+                f"{wanted}, one for each body; or write the drag as "
+                "`MechanicalSystem(..., force=f)`."
+            )
+        return form
+
+    return jtu.tree_map(check, p, fit_form(form, p, name, "p"))
+
+
+@jax.custom_jvp
+def _power_of_speed(v: Inexact[Array, "*bodies d"], power: Array) -> Array:
+    """The speed of each body, to a power of at least 0, of shape `(*bodies, 1)`."""
+    square = jnp.sum(v * v, axis=-1, keepdims=True)
+    moving = square > 0
+    at_rest = jnp.where(power == 0, 1, 0).astype(square.dtype)
+    return jnp.where(moving, jnp.where(moving, square, 1) ** (power / 2), at_rest)
+
+
+@_power_of_speed.defjvp
+def _power_of_speed_jvp(x, dx):
+    (v, power), (dv, dpower) = x, dx
+    square = jnp.sum(v * v, axis=-1, keepdims=True)
+    moving = square > 0
+    square = jnp.where(moving, square, 1)
+    value = _power_of_speed(v, power)
+    along = power * jnp.sum(v * dv, axis=-1, keepdims=True) / square
+    # At rest the derivative may be infinite, but its product with the velocity is zero.
+    slope = jnp.where(moving, value * (along + dpower * jnp.log(square) / 2), 0)
+    return value, slope
