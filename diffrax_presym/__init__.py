@@ -48,6 +48,7 @@ from ._solver import (
     Checked as Checked,
     Compensated as Compensated,
     Composition as Composition,
+    MultistepInterpolation as MultistepInterpolation,
     PresymplecticCoupled as PresymplecticCoupled,
     PresymplecticEuler as PresymplecticEuler,
     PresymplecticGauss as PresymplecticGauss,
@@ -65,6 +66,7 @@ from ._solver import (
     Substeps as Substeps,
     Suzuki4 as Suzuki4,
     SuzukiYoshida as SuzukiYoshida,
+    SymmetricMultistep as SymmetricMultistep,
     TunedLinear8 as TunedLinear8,
     TunedRKN6 as TunedRKN6,
 )
