@@ -48,7 +48,6 @@ from ._solver import (
     Checked as Checked,
     Compensated as Compensated,
     Composition as Composition,
-    MultistepInterpolation as MultistepInterpolation,
     PresymplecticCoupled as PresymplecticCoupled,
     PresymplecticEuler as PresymplecticEuler,
     PresymplecticGauss as PresymplecticGauss,

@@ -63,17 +63,17 @@ class _Carry(NamedTuple):
 class SymmetricMultistep(AbstractMoveSolver[_Carry]):
     r"""A symmetric multistep method: high order with one force evaluation per step.
 
-    8th, 10th or 12th order. One force evaluation per step. Uses interpolation of the
-    order of the scheme for dense/ts output, at no further evaluation:
-    [`diffrax_presym.MultistepInterpolation`][].
+    8th, 10th or 12th order. One force evaluation per step. Uses the polynomial of the
+    last forces for dense/ts output, of the order of the scheme and without further
+    evaluations.
 
-    For a kinetic energy $\tfrac12 \, p \cdot M^{-1} p$ with constant mass, any potential
-    and any scalar friction, with constant steps, at errors of 1e-6 and less: where the
-    force is most of the cost and none of its frequencies is much higher than the
-    others, as for planets, molecules and nonlinear lattices. Steps are short, about
-    15 to 40 to a period. Not for stiff springs next to soft ones or waves on a grid,
-    where [`diffrax_presym.TunedRKN6`][] or [`diffrax_presym.TunedLinear8`][] take longer
-    steps per evaluation, nor for adaptive steps.
+    For a kinetic energy $\tfrac12 \, p \cdot M^{-1} p$ with constant mass, any
+    potential and any scalar friction, with constant steps, at errors of 1e-6 and less:
+    where the force is most of the cost and none of its frequencies is much higher than
+    the others, as for planets, molecules and nonlinear lattices. Not for stiff springs
+    next to soft ones or waves on a grid, where [`diffrax_presym.TunedRKN6`][] or
+    [`diffrax_presym.TunedLinear8`][] take longer steps per evaluation, nor for adaptive
+    steps.
 
     Symmetric, but not symplectic: no form is conserved. Of a symmetric method the error
     in the energy stays small over long times if the motion is regular and the step is
@@ -83,10 +83,11 @@ class SymmetricMultistep(AbstractMoveSolver[_Carry]):
 
     In the variables of [`diffrax_presym.SharedSplit`][], where friction is a force, a
     step is a kick and a drift. The kick is by a filtered force: a linear combination of
-    the last forces and kicks. It is the method $\sum_j \alpha_j x_{n+j} = h^2 \sum_j
-    \beta_j x''_{n+j}$ written for increments, which are summed with compensation, so that
-    rounding errors are those of the force. The momentum at a step is computed from the
-    same history to the same order, and is not fed back.
+    the last forces and kicks. It is the method
+    $\sum_j \alpha_j x_{n+j} = h^2 \sum_j \beta_j x''_{n+j}$ written for increments,
+    which are summed with compensation, so that rounding errors are those of the force.
+    The momentum at a step is computed from the same history to the same order, and is
+    not fed back.
 
     The first `order - 1` steps, each step of another length than the one before it, the
     steps after a jump and those close to a singularity of the friction are steps of
@@ -126,18 +127,18 @@ class SymmetricMultistep(AbstractMoveSolver[_Carry]):
         r"""**Arguments:**
 
         - `order`: 8, 10 or 12. Defaults to 8, which allows the longest steps.
-        - `rho`: the coefficients $\alpha_0, \dots, \alpha_{k/2}$ of a method of your own
-            with $k$ = `order` steps, the first half including the middle one, with
+        - `rho`: the coefficients $\alpha_0, \dots, \alpha_{k/2}$ of a method of your
+            own with $k$ = `order` steps, the first half including the middle one, with
             $\alpha_0 = 1$. Its $\beta_j$ follow from the conditions of order. For
             example `(1, -2, 2, -2, 2)` is method 8A of Quinlan (1999). Defaults to
             `None`, the method of this order of Quinlan and Tremaine (1990).
 
         **Raises:**
 
-        `ValueError` if the order is not one of these or `rho` does not have `order / 2 +
-        1` coefficients of a stable method: a double root at one, and all others simple
-        and on the unit circle. When the solve is traced, `ValueError` if the
-        Hamiltonian has no constant mass.
+        `ValueError` if the order is not one of these or `rho` does not have
+        `order / 2 + 1` coefficients of a stable method: a double root at one, and all
+        others simple and on the unit circle. When the solve is traced, `ValueError` if
+        the Hamiltonian has no constant mass.
         """
         if type(order) is not int or order not in RHO:
             instead = "Write `SymmetricMultistep(8)`, for example."
@@ -204,6 +205,19 @@ class SymmetricMultistep(AbstractMoveSolver[_Carry]):
             return _Step(system, split, self.table, span).backward(stage), None
 
         return Move(forward, backward)
+
+    def between(
+        self,
+        system: System,
+        t0: Array,
+        t1: Array,
+        start: tuple[State, _Carry],
+        t: Array,
+    ) -> State:
+        h = self.step_length(t0, t1)
+        y, carry, _ = self.advance(system, t0, t1, h, *start)
+        info = self.dense_info(system, t0, t1, h, start, (y, carry))
+        return MultistepInterpolation(t0=t0, t1=t1, **info).evaluate(t)
 
     def dense_info(self, system: System, t0, t1, h, start, end) -> dict[str, PyTree]:
         step = _Step(system, self.split(system), self.table, Span(t0, t1, h))
@@ -281,18 +295,20 @@ class _Step:
         momentum = system.add(z[1], h, kick)
         p0 = self._momentum(t0, -h, z[0], momentum, force, filter)
         pick = lambda condition, x, y: jtu.tree_map(partial(jnp.where, condition), x, y)
-        p0 = pick(known == self.table.order - 1, new.p_lost, p0)
+        first_step = known == self.table.order - 1
+        p0 = pick(first_step, new.p_lost, p0)
 
         def start(_):
             moves = _ONE_STEP.moves(system).inverse
-            return _stack(
-                engine.forward(moves, system, self.span, ((q, p), None))[0][0]
-            )
+            (first, _), _ = engine.forward(moves, system, self.span, ((q, p), None))
+            return _stack(first)
 
         taken = _stack((z[0], _as_sums(p0)))
         taken = _either(starting, start, lambda taken: taken, taken)
         q, p = _unstack(taken)
-        lost = rounding_errors(q), pick(starting, rounding_errors(p), new.p_lost)
+        # The rounding error of a momentum not computed by the one-step scheme is zero.
+        kept = pick(starting | first_step, rounding_errors(p), new.p_lost)
+        lost = rounding_errors(q), kept
         # The rest of the history is of no use in the steps at the start.
         rest = pick(starting, new[4:], (momentum, force, filter))
         old = _Carry(jnp.maximum(known, 0), cast_to(-h, new.h), *lost, *rest)
@@ -342,7 +358,8 @@ class _Step:
             jets = []
             for t, y in ((t1, y1), (t0, y0)):
                 slope = system.slope(t, y)
-                second = system.second_derivative(t, y, slope)
+                along = jnp.ones_like(t), slope
+                second = jax.jvp(system.slope, (t, y), along)[1]
                 jets += [y[1], tree_scale(h, slope[1]), tree_scale(h**2, second[1])]
             mean = tree_scale(1 / h, self._times_mass(tree_sub(y1[0], y0[0])))
 
@@ -362,7 +379,7 @@ class _Step:
             if half is None:
                 return values(carry.momentum), slopes, jnp.zeros(6, h.dtype)
             back = -cast_to(LOG_SCALE_NODES, h) * h
-            scale = jax.vmap(lambda s: half.increment(t1, s))(back)
+            scale = jax.vmap(partial(half.increment, t1))(back)
             return values(carry.momentum), slopes, cast_to(scale, h)
 
         starting = carry.count < self.table.order
@@ -385,9 +402,8 @@ def _outer(column: np.ndarray, x: Array) -> Array:
 
 
 def _product(matrix: np.ndarray, rows: Array) -> Array:
-    return jnp.tensordot(
-        cast_to(matrix, rows), rows, 1, precision=lax.Precision.HIGHEST
-    )
+    columns = cast_to(matrix, rows)
+    return jnp.tensordot(columns, rows, 1, precision=lax.Precision.HIGHEST)
 
 
 def _stack(sums: tuple[PyTree[Sum], ...]) -> PyTree:

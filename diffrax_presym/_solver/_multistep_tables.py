@@ -33,7 +33,8 @@ def check_rho(order: int, rho: Sequence[float]) -> tuple[float, ...]:
         rho = tuple(float(x) for x in rho)
     except TypeError:
         raise ValueError(
-            f"{name} needs a sequence of numbers, but got {rho!r}."
+            f"{name} needs a sequence of numbers, but got {rho!r}. For example "
+            f"`rho={RHO[order]}`."
         ) from None
     if len(rho) != order // 2 + 1 or rho[0] != 1:
         raise ValueError(
