@@ -73,7 +73,9 @@ def relative_error(y, exact):
     return np.max(np.abs(y - exact)) / np.max(np.abs(exact))
 
 
-def reference(hamiltonian, y0, times, args=None, *, tolerance=1e-12, batch=False):
+def reference(
+    hamiltonian, y0, times, args=None, *, tolerance=1e-12, batch=False, longest=0.25
+):
     """The solution at all times after the first, independent of what is measured.
 
     A `batch` of initial states has a leading axis, and so has its solution.
@@ -91,11 +93,12 @@ def reference(hamiltonian, y0, times, args=None, *, tolerance=1e-12, batch=False
         else _extrapolated
     )
     # Steps end at the times, so that longer ones would not differ when halved.
-    longest, change = min(0.25, float(np.min(np.diff(times)))), np.inf
+    longest = min(longest, float(np.min(np.diff(times))))
+    least, change = longest / 2500, np.inf
     ys = solution(hamiltonian, y0, times, args, longest)
     while not change < tolerance:
         longest /= 2
-        if longest < 1e-4:
+        if longest < least:
             raise RuntimeError(f"No reference solution: halving changes it by {change}")
         before, ys = ys, solution(hamiltonian, y0, times, args, longest)
         change = relative_error(before, ys)

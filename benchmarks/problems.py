@@ -17,9 +17,9 @@ class Problem:
     name: str
     hamiltonian: dps.AbstractHamiltonian
     # The right-hand side `rhs(t, q, p)` in NumPy, and the integral of the damping rate
-    # from `t` to `t + h`.
-    rhs: Callable
-    increment: Callable
+    # from `t` to `t + h`, for solvers outside of JAX.
+    rhs: Callable | None
+    increment: Callable | None
     q0: Any
     p0: Any
     t1: float
@@ -27,6 +27,8 @@ class Problem:
     linear: bool = False
     # The solution at `t1`, where it has a closed form.
     exact: Callable | None = None
+    # The first step of the reference solution that is tried.
+    longest: float = 0.25
 
     @property
     def y0(self):
@@ -36,8 +38,12 @@ class Problem:
         """The solution at `t1`."""
         if self.exact is not None:
             return self.exact()
-        q, p = reference(self.hamiltonian, self.y0, [0.0, self.t1])
+        q, p = self.solution([0.0, self.t1])
         return np.array([q[0], p[0]])
+
+    def solution(self, ts):
+        """The solution at all times after the first."""
+        return reference(self.hamiltonian, self.y0, ts, longest=self.longest)
 
 
 def conformal(potential, damping, kinetic=None):

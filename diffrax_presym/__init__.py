@@ -70,6 +70,7 @@ from ._solver import (
     Substeps as Substeps,
     Suzuki4 as Suzuki4,
     SuzukiYoshida as SuzukiYoshida,
+    SymmetricMultistep as SymmetricMultistep,
     TunedLinear8 as TunedLinear8,
     TunedRKN6 as TunedRKN6,
 )

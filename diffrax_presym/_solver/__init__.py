@@ -19,6 +19,7 @@ from ._euler import PresymplecticEuler as PresymplecticEuler
 from ._gauss import PresymplecticGauss as PresymplecticGauss
 from ._leapfrog import PresymplecticLeapfrog as PresymplecticLeapfrog
 from ._midpoint import PresymplecticMidpoint as PresymplecticMidpoint
+from ._multistep import SymmetricMultistep as SymmetricMultistep
 from ._splitting import (
     BlanesCasasRKN8 as BlanesCasasRKN8,
     BlanesMoan4 as BlanesMoan4,
