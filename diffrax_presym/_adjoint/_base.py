@@ -58,9 +58,10 @@ class AbstractFixedStepAdjoint(dfx.AbstractAdjoint):
             )
             n = steps.total // 2
             t0, t1 = (system.time(steps.time(n + i)) for i in (0, 1))
-            system, h = system.with_table(carry.table), solver.step_length(t0, t1)
-            table = solver.fitted(system, t1, h, y).table
+            h = solver.step_length(t0, t1)
+            table = solver.tabulated(system, h, y, both=True).table
             system, carry = system.with_table(table.assume(False)), carry.carry
+            first = init_state.solver_state.table
         if init_state.made_jump is not False:
             # The solver state is stale, and is recomputed before the first step.
             restart = lambda: solver.start(system, system.time(rest["t0"]), y)
@@ -80,7 +81,8 @@ class AbstractFixedStepAdjoint(dfx.AbstractAdjoint):
         out, counts = eqx.partition(out, eqx.is_inexact_array)
         out = eqx.combine(out, eqxi.nondifferentiable_backward(counts))
         if tabulated:
-            at_end = Tabulated(out.solver_state, system.table.assume(True))
+            # As it was, so that it has the form that a solve expects.
+            at_end = Tabulated(out.solver_state, first)
             where = lambda x: x.solver_state
             out = eqx.tree_at(where, out, at_end, is_leaf=_is_none)
         return out, {}

@@ -217,21 +217,20 @@ class _Table(eqx.Module):
         """The same table, with or without the assumption that no other times occur."""
         return _Table(self.times, self.radius, self.entries, complete)
 
-    def at(self, i: int, t: Time, x: Array, compute: Callable) -> tuple[Array, Array]:
+    def product(self, i: int, part: int, t: Time, time: Array, x: Array, compute):
+        """The change (part 0) or integral (part 1) of a leaf over a time, times `x`;
+        by `compute` if the time is not in the table."""
         entry = self.entries[i]
         assert entry is not None
-        distances = jnp.abs(cast_to(self.times, x) - x)
+        distances = jnp.abs(cast_to(self.times, time) - time)
         nearest = jnp.argmin(distances)
-        distance, radius = distances[nearest], cast_to(self.radius, x)
-        stored = lambda: tuple(cast_to(part[nearest], x) for part in entry)
+        distance, radius = distances[nearest], cast_to(self.radius, time)
+        stored = lambda: matvec(cast_to(entry[part][nearest], x), x)
         if self.complete:
-            valid = distance <= radius
-            change, integral = stored()
-            return jnp.where(valid, change, jnp.nan), jnp.where(
-                valid, integral, jnp.nan
-            )
+            return jnp.where(distance <= radius, stored(), jnp.nan)
         # Times of other steps, and times that differ by more than rounding.
-        rounding = 4 * jnp.finfo(x.dtype).eps * (jnp.abs(cast_to(t, x)) + jnp.abs(x))
+        size = jnp.abs(cast_to(t, time)) + jnp.abs(time)
+        rounding = 4 * jnp.finfo(time.dtype).eps * size
         found = distance <= jnp.minimum(rounding, radius)
         return jax.lax.cond(found, stored, compute)
 
@@ -311,16 +310,13 @@ class ViscousFriction(AbstractFriction):
         parts = zip(leaves, rates, strict=True)
         return back([one(i, x, rate) for i, (x, rate) in enumerate(parts)])
 
-    def _exponential(self, matrix: Array, i: int, t: Time, x: Time):
-        """The change and the integral over a time `x`, from the table if known."""
-        x = cast_to(x, matrix)
-
-        def compute():
-            return tuple(part[0] for part in exponentials(matrix, x[None]))
-
+    def _product(self, part: int, matrix: Array, i: int, t: Time, time: Time, x: Array):
+        """The change (part 0) or integral (part 1) over a time, times `x`."""
+        time = cast_to(time, x)
+        compute = lambda: matvec(exponentials(matrix, time[None])[part][0], x)
         if self.table is None:
             return compute()
-        return self.table.at(i, t, x, compute)
+        return self.table.product(i, part, t, time, x, compute)
 
     # What it does.
 
@@ -329,7 +325,7 @@ class ViscousFriction(AbstractFriction):
         return self._each(
             p,
             lambda x, law: law.decay(t, h, x),
-            lambda x, matrix, i: matvec(self._exponential(matrix, i, t, time)[0], x),
+            lambda x, matrix, i: self._product(0, matrix, i, t, time, x),
             lambda x, apply: exponential_products(apply, cast_to(time, x), x)[0],
         )
 
@@ -359,7 +355,7 @@ class ViscousFriction(AbstractFriction):
             return self._each(
                 p,
                 entry,
-                lambda x, matrix, i: matvec(self._exponential(matrix, i, t, h)[1], x),
+                lambda x, matrix, i: self._product(1, matrix, i, t, h, x),
                 lambda x, apply: exponential_products(apply, cast_to(h, x), x)[1],
             )
         times = elapsed(self.law)

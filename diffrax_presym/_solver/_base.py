@@ -49,9 +49,9 @@ class Tabulated(NamedTuple):
     table: PyTree
 
 
-def signed(lengths: np.ndarray) -> np.ndarray:
-    """Lengths forwards and backwards in time, in order."""
-    return np.unique(np.concatenate([-lengths, lengths]))
+def signed(lengths: np.ndarray, both: bool) -> np.ndarray:
+    """Lengths forwards or in both directions of time, in order."""
+    return np.unique(np.concatenate([-lengths, lengths]) if both else lengths)
 
 
 class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
@@ -143,11 +143,16 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         system = self.tabulated(system, h, y0)
         return Tabulated(carry, system.table)  # pyright: ignore[reportReturnType]
 
-    def tabulated(self, system: System, h: Array, y: State) -> System:
-        """The system, with what friction computes once for a step of this length."""
+    def tabulated(
+        self, system: System, h: Array, y: State, both: bool = False
+    ) -> System:
+        """The system, with what friction computes once for steps of this length.
+
+        In `both` directions of time, or forwards alone.
+        """
         if system.friction is None:
             return system
-        times = cast_to(signed(self.lengths(system)), h) * h
+        times = cast_to(signed(self.lengths(system), both), h) * h
         return system.with_table(system.friction.tabulate(y[1], times))
 
     def fitted(self, system: System, t: Array, h: Array, y: State) -> System:
@@ -155,15 +160,17 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         table = system.table
         if table is None:
             return system
-        lengths = signed(self.lengths(system))
-        times = cast_to(lengths, h) * h
+        forwards = self.lengths(system)
+        both = len(table.times) > len(forwards)
+        lengths = signed(forwards, both)
         # Neighbours must not be mistaken for each other.
-        gap = np.min(np.diff(lengths), initial=1.0) / np.max(lengths, initial=1.0)
-        eps = jnp.finfo(h.dtype).eps
+        gap, eps = np.min(np.diff(lengths), initial=1.0), jnp.finfo(h.dtype).eps
         rounding = jnp.minimum(4 * eps * jnp.abs(t), float(gap) / 8 * jnp.abs(h))
-        fits = jnp.all(jnp.abs(times - table.times) <= rounding + 4 * eps * jnp.abs(h))
-        table, compute = table.assume(True), lambda: self.tabulated(system, h, y).table
-        return system.with_table(lax.cond(fits, lambda: table, compute))
+        errors = jnp.abs(cast_to(lengths, h) * h - table.times)
+        fits = jnp.all(errors <= rounding + 4 * eps * jnp.abs(h))
+        known = lambda: table.assume(True)
+        compute = lambda: self.tabulated(system, h, y, both).table
+        return system.with_table(lax.cond(fits, known, compute))
 
     def attempt(
         self, system: System, t0: Array, t1: Array, h: Array, y: State, carry: _Carry

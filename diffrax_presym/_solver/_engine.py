@@ -103,7 +103,7 @@ def time_lengths(moves: Moves) -> np.ndarray:
         else:
             yield 1.0
 
-    return np.unique(np.round(np.abs(list(each(moves))), 15))
+    return np.unique(np.round(list(each(moves)), 15))
 
 
 def forward(moves: Moves, system: System, span: Span, stage: Stage) -> Outcome:
