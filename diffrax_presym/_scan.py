@@ -24,8 +24,9 @@ def scan_stages(stage: Callable, init: PyTree, moves: PyTree, reverse: bool = Fa
     separate kernel on a CPU, and there are many more of them than kernels that update
     the state.
     """
+    unroll = 1 if _is_cpu() else True
     if sum(jnp.size(x) for x in jtu.tree_leaves(init)) < _MANY:
-        return lax.scan(stage, init, moves, reverse=reverse)
+        return lax.scan(stage, init, moves, reverse=reverse, unroll=unroll)
     first = jtu.tree_map(lambda x: x[0], moves)
     closed, out = jax.make_jaxpr(stage, return_shape=True)(init, first)
     jaxpr, constants, structure = closed.jaxpr, closed.consts, jtu.tree_structure(out)
@@ -58,7 +59,17 @@ def scan_stages(stage: Callable, init: PyTree, moves: PyTree, reverse: bool = Fa
         inputs = *constants, *numbers, *jtu.tree_leaves((state, moves))
         return jtu.tree_unflatten(structure, eval_jaxpr(rest, (), *inputs))
 
-    return lax.scan(body, init, (jax.vmap(prepare)(moves), moves), reverse=reverse)
+    rows = jax.vmap(prepare)(moves), moves
+    return lax.scan(body, init, rows, reverse=reverse, unroll=unroll)
+
+
+def _is_cpu() -> bool:
+    """Whether iterations are cheap, and code is not.
+
+    On a GPU or TPU an iteration takes microseconds, whatever is in it, so that stages
+    are written out. On a CPU they were measured to take four to five times as long so.
+    """
+    return jax.default_backend() == "cpu"
 
 
 def _variables(atoms) -> list:

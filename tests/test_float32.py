@@ -140,7 +140,8 @@ def check_dtypes(hamiltonian, solver, y, **kwargs):
     expected = jtu.tree_map(lambda x: x.dtype, y)
     assert y1 == expected and dense == expected
     assert new_carry == carry
-    for values in dense_info.values():
+    inner = dense_info.pop("inner", ())
+    for values in (*dense_info.values(), *inner):
         assert values == expected
     return carry
 

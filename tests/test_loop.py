@@ -38,6 +38,7 @@ def energy(t, y, args):
 @eqx.filter_jit
 def solve(adjoint, solver, saveat, t0=T0, t1=T1, dt0: Any = 0.1, dtype=None, **kwargs):
     cast = lambda x: jnp.asarray(x, float if dtype is None else dtype)
+    options: dict[str, Any] = {"max_steps": 64} | kwargs
     return dfx.diffeqsolve(
         dps.HamiltonianTerm(SYSTEM),
         solver,
@@ -48,7 +49,7 @@ def solve(adjoint, solver, saveat, t0=T0, t1=T1, dt0: Any = 0.1, dtype=None, **k
         args=cast(1.3),
         adjoint=adjoint,
         saveat=saveat,
-        **({"max_steps": 64} | kwargs),
+        **options,
     )
 
 
@@ -143,7 +144,8 @@ def test_a_solve_that_fails():
             max_steps=64,
         )
 
-    ours, theirs = run(OURS[0]), run(DIFFRAX)
+    ours: Any = run(OURS[0])
+    theirs: Any = run(DIFFRAX)
     assert ours.result == theirs.result != dfx.RESULTS.successful
     assert 0 < jnp.sum(jnp.isfinite(theirs.ts)) < 20
     np.testing.assert_allclose(ours.ts, theirs.ts, rtol=1e-15)
@@ -247,7 +249,7 @@ def test_friction_that_is_infinite_at_the_start():
     )
     ts = jnp.array([0.0, 1e-3, 0.1, 0.2, 0.31, 1.0])
 
-    def run(adjoint, q):
+    def run(adjoint, q) -> Any:
         return dfx.diffeqsolve(
             dps.HamiltonianTerm(system),
             dps.BlanesMoanRKN4(),
@@ -297,7 +299,7 @@ def test_nothing_but_states_is_batched():
     saveat = dfx.SaveAt(ts=jnp.linspace(0.0, 2.0, 7))
 
     def loss(q):
-        sol = dfx.diffeqsolve(
+        sol: Any = dfx.diffeqsolve(
             dps.HamiltonianTerm(PENDULUM),
             dps.PresymplecticLeapfrog(),
             *(0.0, 2.0, 0.1, (q, 0 * q)),

@@ -205,8 +205,9 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         times = system.time(t0), system.time(t1)
         h = self.step_length(*times)
         system = self.fitted(system.with_table(table), times[1], h, y0)
-        *outputs, carry, result = self._step(system, t0, t1, y0, carry, made_jump)
-        return *outputs, Tabulated(carry, system.table), result
+        out = self._step(system, t0, t1, y0, carry, made_jump)
+        y1, error, dense_info, carry, result = out
+        return y1, error, dense_info, Tabulated(carry, system.table), result
 
     def _step(self, system: System, t0, t1, y0, solver_state, made_jump):
         t0, t1 = system.time(t0), system.time(t1)
