@@ -50,8 +50,8 @@ class AbstractFixedStepAdjoint(dfx.AbstractAdjoint):
         if passed_controller_state:
             raise ValueError(refuse(self, "a `controller_state`"))
         y, carry = init_state.y, init_state.solver_state
-        tabulated = isinstance(carry, Tabulated)
-        if tabulated:
+        first = carry.table if isinstance(carry, Tabulated) else None
+        if isinstance(carry, Tabulated):
             # Most steps are of one length, but not all.
             steps = Steps(
                 *(rest[x] for x in ("stepsize_controller", "t0", "t1", "dt0"))
@@ -61,7 +61,6 @@ class AbstractFixedStepAdjoint(dfx.AbstractAdjoint):
             h = solver.step_length(t0, t1)
             table = solver.tabulated(system, h, y, both=True).table
             system, carry = system.with_table(table.assume(False)), carry.carry
-            first = init_state.solver_state.table
         if init_state.made_jump is not False:
             # The solver state is stale, and is recomputed before the first step.
             restart = lambda: solver.start(system, system.time(rest["t0"]), y)
@@ -80,7 +79,7 @@ class AbstractFixedStepAdjoint(dfx.AbstractAdjoint):
         # To JAX all outputs of a custom rule have derivatives, even integers.
         out, counts = eqx.partition(out, eqx.is_inexact_array)
         out = eqx.combine(out, eqxi.nondifferentiable_backward(counts))
-        if tabulated:
+        if first is not None:
             # As it was, so that it has the form that a solve expects.
             at_end = Tabulated(out.solver_state, first)
             where = lambda x: x.solver_state
