@@ -32,7 +32,7 @@ PUBLIC |= {
     f"diagnostics.{name}": value
     for name, value in vars(dps.diagnostics).items()
     if not name.startswith("_")
-    and getattr(value, "__module__", "").endswith(".diagnostics")
+    and ".diagnostics." in getattr(value, "__module__", "")
 }
 REFERENCE = re.compile(
     r"\[`?(diffrax_presym\.[\w.]+)`?\]\[|\]\[(diffrax_presym\.[\w.]+)\]"

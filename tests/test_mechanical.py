@@ -194,8 +194,8 @@ def test_long_steps_refuse_friction_other_than_one_rate():
     one = dps.MechanicalSystem(DENSE, driven, dps.ConstantDamping(0.2))
     same = dps.ConformalHamiltonian(DENSE, driven, dps.ConstantDamping(0.2))
     for solver in (dps.TunedLinear8(), dps.TunedRKN6()):
-        ends = [step(x, solver, 0.0, 0.1, Y0)[0] for x in (one, same)]
-        assert_close(*ends, 1e-15)
+        found, wanted = (step(x, solver, 0.0, 0.1, Y0)[0] for x in (one, same))
+        assert_close(found, wanted, 1e-15)
 
 
 # Structure.
@@ -211,7 +211,7 @@ def test_phase_volume_contracts_by_the_trace(name):
 
 def test_the_trace_by_hand():
     term = dps.HamiltonianTerm(system("matrix"))
-    end = lambda *y: step(system("matrix"), dps.TunedRKN6(), 0.3, 0.5, y)[0]
+    end = lambda q, p: step(system("matrix"), dps.TunedRKN6(), 0.3, 0.5, (q, p))[0]
     jacobian = jax.jacfwd(end, argnums=(0, 1))(*Y0)
     matrix = np.block([[np.array(x) for x in row] for row in jacobian])
     trace = np.trace(np.array(C) @ np.linalg.inv(np.array(MASS)))
@@ -225,7 +225,7 @@ def test_the_trace_by_hand():
 
 def test_a_kick_with_friction_by_place_contracts_by_the_friction_there():
     q, p = Y0
-    local = system("place, matrix")
+    local: Any = system("place, matrix")
     values, force = local.local_values(0.0, q, None), jnp.ones(3)
     change = lambda p: p + local.kick(0.0, 0.3, p, force, values, 6)
     gamma = (1 + q[0] ** 2) * C @ jnp.linalg.inv(MASS)
@@ -332,6 +332,7 @@ def test_exponentials_fail_rather_than_be_inaccurate():
 def test_operators_solve_the_equation_of_friction(name):
     laws = ALL[name] if isinstance(ALL[name], list) else [ALL[name]]
     friction = as_friction(laws, MASS, None)
+    assert friction is not None
     t, h, p, force = 0.3, 0.4, Y0[1], Y0[0]
 
     def rhs(s, x, force):
