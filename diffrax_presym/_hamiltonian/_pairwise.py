@@ -14,13 +14,11 @@ class _PairwisePotential(eqx.Module):
     fn: Callable
     masses: Float[Array, " n"] | None
 
-    def __call__(
-        self, t: Time, q: Float[Array, "n dim"], args: PyTree = None
-    ) -> Scalar:
+    def __call__(self, t: Time, q: PyTree, args: PyTree = None) -> Scalar:
         if not isinstance(q, jax.Array) or q.ndim != 2:
             raise ValueError(
-                "`pairwise_potential` needs positions in one array of shape `(n, dim)`, "
-                f"a row for each of `n` particles, but got {q!r}."
+                "`pairwise_potential` needs positions in one array of shape "
+                f"`(n, dim)`, a row for each of `n` particles, but got {q!r}."
             )
         n = len(q)
         if self.masses is not None and self.masses.shape != (n,):
@@ -44,7 +42,8 @@ class _PairwisePotential(eqx.Module):
 
 
 def pairwise_potential(fn: Callable, masses=None) -> Callable:
-    r"""The potential $V(t, q) = \sum_{i < j} m_i m_j \, f(t, |q_i - q_j|)$ of particles.
+    r"""The potential of particles that interact in pairs,
+    $V(t, q) = \sum_{i < j} m_i m_j \, f(t, |q_i - q_j|)$.
 
     For planets, molecules and other pairs of particles, as the `potential` of a
     Hamiltonian. Positions are an array of shape `(n, dim)`. Its force is computed from
@@ -62,10 +61,10 @@ def pairwise_potential(fn: Callable, masses=None) -> Callable:
 
     **Arguments:**
 
-    - `fn`: the energy of a pair, an elementwise function `fn(t, r, args)` of an array of
-        distances.
-    - `masses`: an array of shape `(n,)`, by whose products the energies are multiplied:
-        masses or charges. Defaults to `None`, all one.
+    - `fn`: the energy of a pair, an elementwise function `fn(t, r, args)` of an array
+        of distances.
+    - `masses`: an array of shape `(n,)`, by whose products the energies are
+        multiplied: masses or charges. Defaults to `None`, all one.
 
     **Returns:**
 
@@ -73,13 +72,13 @@ def pairwise_potential(fn: Callable, masses=None) -> Callable:
 
     **Raises:**
 
-    `ValueError` if `fn` is not a function, and when the solve is traced if the positions
-    or masses have other shapes.
+    `ValueError` if `fn` is not a function, and when the solve is traced if the
+    positions or masses have other shapes.
     """
     if not callable(fn):
         raise ValueError(
-            "`pairwise_potential(fn)` must be a function `fn(t, r, args)` of distances, "
-            f"but got {fn!r}."
+            "`pairwise_potential(fn)` must be a function `fn(t, r, args)` of "
+            f"distances, but got {fn!r}."
         )
     if masses is not None:
         masses = as_parameter(masses, "`pairwise_potential(fn, masses)`")
