@@ -42,11 +42,17 @@ SCHEMES = {
     "BlanesCasasRKN8": Scheme(dps.BlanesCasasRKN8(), 8, 19),
     # Of order 8 for an oscillator, and 4 for other forces.
     "TunedLinear8": Scheme(dps.TunedLinear8(), 4, 14),
+    # One evaluation per step, but 19 in each of the first `order - 1` steps.
+    "SymmetricMultistep(8)": Scheme(dps.SymmetricMultistep(8), 8, 1),
+    "SymmetricMultistep(10)": Scheme(dps.SymmetricMultistep(10), 10, 1),
+    "SymmetricMultistep(12)": Scheme(dps.SymmetricMultistep(12), 12, 1),
     "SofroniouSpaletta10": Scheme(dps.SofroniouSpaletta10(), 10, 35),
     "PresymplecticTao": Scheme(dps.PresymplecticTao(), 2, 3),
     "PresymplecticCoupled(2)": Scheme(dps.PresymplecticCoupled(2), 2, 3),
     "PresymplecticCoupled(4)": Scheme(dps.PresymplecticCoupled(4), 4, 11),
     "PresymplecticCoupled(6)": Scheme(dps.PresymplecticCoupled(6), 6, 27),
+    # Six stages at once, in each of several iterations.
+    "PresymplecticGauss(6)": Scheme(dps.PresymplecticGauss(6), 12, 40),
     "PresymplecticProjected(2)": Scheme(dps.PresymplecticProjected(2), 2, 3),
     "PresymplecticProjected(4)": Scheme(dps.PresymplecticProjected(4), 4, 11),
     "PresymplecticProjected(6)": Scheme(dps.PresymplecticProjected(6), 6, 27),

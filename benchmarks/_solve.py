@@ -50,19 +50,25 @@ def last(sol) -> Any:
     return jax.tree.map(lambda y: y[-1], sol.ys)
 
 
-def final_state(system, solver, times, y0, x, args=None, *, adaptive=False):
-    """The state after `x` equal steps, or of adaptive ones with tolerance `x`.
+def states(system, solver, times, y0, x, args=None, *, adaptive=False, **options):
+    """What is saved in `x` equal steps, or in adaptive ones with tolerance `x`: by
+    default the final state.
 
     It is not a number where the solve failed.
     """
     t0, t1 = times
     if adaptive:
-        controller = dfx.PIDController(rtol=x, atol=x)
-        sol = solve(system, solver, t0, t1, None, y0, args, controller)
-    else:
-        sol = solve(system, solver, t0, t1, (t1 - t0) / x, y0, args)
+        options["controller"] = dfx.PIDController(rtol=x, atol=x)
+    dt0 = None if adaptive else (t1 - t0) / x
+    sol = solve(system, solver, t0, t1, dt0, y0, args, **options)
     good = sol.result == dfx.RESULTS.successful
-    return jax.tree.map(lambda y: jnp.where(good, y, jnp.nan), last(sol))
+    ys = sol.ys if "saveat" in options else last(sol)
+    return jax.tree.map(lambda y: jnp.where(good, y, jnp.nan), ys)
+
+
+def final_state(system, solver, times, y0, x, args=None, *, adaptive=False):
+    """The state after `x` equal steps, or of adaptive ones with tolerance `x`."""
+    return states(system, solver, times, y0, x, args, adaptive=adaptive)
 
 
 def relative_error(y, exact):

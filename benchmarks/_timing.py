@@ -70,22 +70,32 @@ def interleaved(
 
 
 def error_curves(
-    runs: Mapping[Any, tuple[Callable, list]], error: Callable, repeats: int
+    runs: Mapping[Any, tuple[Callable, list]],
+    error: Callable,
+    repeats: int,
+    enough: tuple[float, float] | None = None,
 ) -> dict[Any, list[tuple[float, float]]]:
     """The points `(error, seconds)` of every run, a solve and its sweep.
 
     `error` maps what the solve returns to a number; points that are not finite are
-    omitted.
+    omitted. Sweeps in order of cost end at an error that is small `enough`, or at a
+    run that takes so many seconds.
     """
+    least, longest = (0.0, math.inf) if enough is None else enough
     errors, calls = {}, {}
     for key, (solve, sweep) in runs.items():
         # The first call after another function's is slow to start.
         calls[key, None] = functools.partial(solve, sweep[0])
         for i, x in enumerate(sweep):
             call = functools.partial(solve, x)
-            found = float(error(jax.block_until_ready(call())))
+            if i == 0:
+                jax.block_until_ready(call())  # compiles
+            result, seconds, _ = timed(call)
+            found = float(error(result))
             if math.isfinite(found):
                 errors[key, i], calls[key, i] = found, call
+            if found < least / 3 or seconds > longest:
+                break
     timings = interleaved(calls, repeats, warm_up=False)
     curves = {key: [] for key in runs}
     for (key, i), found in errors.items():

@@ -27,8 +27,9 @@ class Problem:
     linear: bool = False
     # The solution at `t1`, where it has a closed form.
     exact: Callable | None = None
-    # The first step of the reference solution that is tried.
-    longest: float = 0.25
+    # About the shortest period over six, in which sweeps of steps and the steps of the
+    # reference solution are measured.
+    unit: float = 1.0
 
     @property
     def y0(self):
@@ -43,7 +44,7 @@ class Problem:
 
     def solution(self, ts):
         """The solution at all times after the first."""
-        return reference(self.hamiltonian, self.y0, ts, longest=self.longest)
+        return reference(self.hamiltonian, self.y0, ts, longest=self.unit / 4)
 
 
 def conformal(potential, damping, kinetic=None):

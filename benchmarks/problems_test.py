@@ -107,7 +107,8 @@ def argon():
         inverse = sigma**6 / jnp.sum(d**2, axis=0) ** 3
         return strength * jnp.sum(inverse**2 - inverse)
 
-    return unforced("argon crystal", conformal(potential, None), q0, v0, 0.02)
+    hamiltonian = conformal(potential, None)
+    return unforced("argon crystal", hamiltonian, q0, v0, 0.02, unit=3e-4)
 
 
 def fermi_pasta_ulam_alpha(n=32):

@@ -89,7 +89,7 @@ def planets():
         q0.T,
         (mass[:, None] * v0).T,
         73000.0,
-        longest=100.0,
+        unit=600.0,
     )
 
 

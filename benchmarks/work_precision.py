@@ -7,6 +7,11 @@ shrinks both, against `reference`. Tables give the time to reach an error, read 
 method's curve, and the geometric mean over the problems of (best Diffrax solver) / (our
 best). The figure goes to `docs/img/`. SciPy, heyoka, pyhamsys and symplecta are
 measured if they are installed.
+
+`--set tuning` and `--set test` measure the two halves of a larger set of problems,
+without solvers from outside of JAX, with the worst problem beside the mean: nothing in
+the package was tuned on the test half. `--saved` saves at 201 times, where the error is
+the largest over these, relative to the largest entry of the solution.
 """
 
 import math
@@ -18,11 +23,14 @@ import time
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import problems
+import problems_test
+import problems_tuning
 from _plot import error_against_time, FOLDER
 from _report import command_line, Table
 from _schemes import DIFFRAX, SCHEMES
-from _solve import final_state, relative_error
+from _solve import relative_error, states
 from _timing import error_curves, time_to
 from outside import heyoka_runs, pyhamsys_runs, scipy_runs, STEPS, symplecta_runs
 
@@ -44,58 +52,94 @@ OURS = [
     "BlanesCasasRKN8",
     "TunedRKN6",
     "TunedLinear8",
+    "SymmetricMultistep(8)",
+    "SymmetricMultistep(10)",
+    "SymmetricMultistep(12)",
 ]
+# For energies that are not separable.
+OTHERS = ["PresymplecticCoupled(4)", "PresymplecticCoupled(6)", "PresymplecticGauss(6)"]
+SETS = {
+    "seven": problems.PROBLEMS,
+    "tuning": problems_tuning.PROBLEMS,
+    "test": problems_test.PROBLEMS,
+}
+SAVED = 201
 
 
-def solver_of(problem, terms, solver, adaptive=False):
-    """`solve(x)`, with `x` the number of steps, or the tolerance."""
-    times = 0.0, problem.t1
-    return jax.jit(
-        lambda x: final_state(terms, solver, times, problem.y0, x, adaptive=adaptive)
-    )
+def solver_of(problem, terms, solver, adaptive=False, ts=None):
+    """`solve(x)`, with `x` the number of steps, or the tolerance.
+
+    It returns the final state, or those at all of `ts`.
+    """
+    times, ours = (0.0, problem.t1), isinstance(solver, dps.AbstractPresymplecticSolver)
+    options = {}
+    if ts is not None:
+        options["saveat"] = dfx.SaveAt(ts=jnp.asarray(ts))
+    if ts is not None and ours:
+        reversible = solver.reverse is not None
+        fast = dps.ReversibleAdjoint if reversible else dps.FixedStepAdjoint
+        options["adjoint"] = fast()
+    args = terms, solver, times, problem.y0
+    return jax.jit(lambda x: states(*args, x, adaptive=adaptive, **options))
 
 
-def semi_implicit_euler(problem):
+def semi_implicit_euler(problem, ts=None):
     """Diffrax's only symplectic solver, on the canonical equations, which it needs."""
     h = problem.hamiltonian
     velocity = lambda t, P, args: h.velocity(t, None, h.from_canonical(t, P))
     force = lambda t, q, args: h.to_canonical(t, h.force(t, q, None))
     terms = (dfx.ODETerm(velocity), dfx.ODETerm(force))
-    solve = solver_of(problem, terms, dfx.SemiImplicitEuler())
+    solve = solver_of(problem, terms, dfx.SemiImplicitEuler(), ts=ts)
 
     @jax.jit
     def mechanical(x):
         q, P = solve(x)
-        return q, h.from_canonical(problem.t1, P)
+        if ts is None:
+            return q, h.from_canonical(problem.t1, P)
+        return q, jax.vmap(h.from_canonical)(jnp.asarray(ts), P)
 
     return mechanical
 
 
 def step_counts(problem, evaluations, quick):
     """Numbers of steps by factors of the square root of two, from 0.4 per stage."""
-    most = 4e3 if len(problem.q0) >= 1000 else 2e4 if quick else 1e5
-    least = problem.t1 / (0.8 * evaluations)
+    most = 4e3 if np.size(problem.q0) >= 1000 else 2e4 if quick else 1e5
+    least = problem.t1 / (0.8 * evaluations * problem.unit)
     count = max(1, math.ceil(2 * math.log2(most / evaluations / least)))
     return [jnp.asarray(math.ceil(least * 2 ** (k / 2))) for k in range(count)]
 
 
-def all_runs(problem, quick):
+def accepts(solver, problem, term):
+    """Whether a solver supports the system, as it says when a solve is traced."""
+    try:
+        jax.eval_shape(solver_of(problem, term, solver), jnp.asarray(10))
+    except ValueError:
+        return False
+    return True
+
+
+def all_runs(problem, quick, ts=None):
     """Every method: `{(group, name): (solve, sweep)}`."""
     term = dps.HamiltonianTerm(problem.hamiltonian)
+    run_of = lambda *args, **options: solver_of(problem, *args, ts=ts, **options)
     runs = {}
-    for name in OURS:
-        if problem.linear or "Linear" not in name:
-            solver, _, evaluations = SCHEMES[name]
+    separable = problem.hamiltonian.splits != ()
+    for name in OURS if separable else OTHERS:
+        solver, _, evaluations = SCHEMES[name]
+        if (problem.linear or "Linear" not in name) and accepts(solver, problem, term):
             sweep = step_counts(problem, evaluations, quick)
-            runs["ours", name] = solver_of(problem, term, solver), sweep
+            runs["ours", name] = run_of(term, solver), sweep
     for name, (solver, _, evaluations) in DIFFRAX.items():
-        run = solver_of(problem, term, solver, adaptive=True)
         tolerances = [jnp.asarray(x) for x in TOLERANCES]
-        runs["diffrax", f"{name}, adaptive"] = run, tolerances
+        adaptive = run_of(term, solver, adaptive=True)
+        runs["diffrax", f"{name}, adaptive"] = adaptive, tolerances
         sweep = step_counts(problem, evaluations, quick)
-        runs["diffrax", f"{name}, constant"] = solver_of(problem, term, solver), sweep
-    run = semi_implicit_euler(problem)
-    runs["diffrax", "SemiImplicitEuler"] = run, step_counts(problem, 1, quick)
+        runs["diffrax", f"{name}, constant"] = run_of(term, solver), sweep
+    if separable and isinstance(problem.q0, np.ndarray):
+        run = semi_implicit_euler(problem, ts)
+        runs["diffrax", "SemiImplicitEuler"] = run, step_counts(problem, 1, quick)
+    if problem.rhs is None or ts is not None:
+        return runs
     tolerances = TOLERANCES[1::4] if quick else TOLERANCES
     steps = STEPS[:2] if quick else STEPS
     outside = heyoka_runs(problem, tolerances) | scipy_runs(problem, tolerances[::2])
@@ -137,8 +181,12 @@ def show(ratios, form):
     for target, each in ratios.items():
         # A sweep that ends before the target leaves no ratio.
         known = [r for r in each if 0 < r < math.inf]
-        mean = form.format(statistics.geometric_mean(known)) if known else "      -"
-        print(f"  at {target:.0e}: {''.join(map(form.format, each))}   mean {mean}")
+        mean, least = ("      -", "      -")
+        if known:
+            mean = form.format(statistics.geometric_mean(known))
+            least = form.format(min(known))
+        line = "".join(map(form.format, each))
+        print(f"  at {target:.0e}: {line}   mean {mean}   least {least}")
 
 
 def picture(results, path):
@@ -158,21 +206,33 @@ def main():
     parser = command_line(__doc__)
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--output", type=pathlib.Path, default=FOLDER)
+    parser.add_argument("--set", choices=SETS, default="seven")
+    parser.add_argument("--saved", action="store_true", help="save at 201 times")
     options = parser.parse_args()
     repeats = 1 if options.quick else options.repeats
-    makers = problems.PROBLEMS[::3] if options.quick else problems.PROBLEMS
+    makers = SETS[options.set]
+    makers = makers[::3] if options.quick else makers
     results = {}
     print(f"{platform.processor() or platform.machine()}, median of {repeats} runs")
     for make in makers:
         problem, start = make(), time.perf_counter()
-        exact, runs = problem.reference(), all_runs(problem, options.quick)
+        ts = np.linspace(0, problem.t1, SAVED) if options.saved else None
+        if ts is None:
+            exact = problem.reference()
+        else:
+            first = jax.tree.map(lambda x: x[None], problem.y0)
+            later = problem.solution(ts)
+            exact = jax.tree.map(lambda a, b: np.concatenate([a, b]), first, later)
+        runs = all_runs(problem, options.quick, ts)
         error = lambda y, exact=exact: relative_error(y, exact)
-        results[problem.name] = error_curves(runs, error, repeats)
+        enough = None if options.set == "seven" else (min(TARGETS), 1.0)
+        results[problem.name] = error_curves(runs, error, repeats, enough)
         taken = time.perf_counter() - start
         print(f"{problem.name}: measured in {taken:.0f} s", flush=True)
         jax.clear_caches()
     tables(results)
-    picture(results, options.output / "work_precision.png")
+    if options.set == "seven" and not options.saved:
+        picture(results, options.output / "work_precision.png")
 
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ from ._hamiltonian import (
     LogBarrierMirror as LogBarrierMirror,
     MechanicalSystem as MechanicalSystem,
     MirrorMap as MirrorMap,
+    pairwise_potential as pairwise_potential,
     PNormMirror as PNormMirror,
     PolynomialScaling as PolynomialScaling,
     QuadraticKinetic as QuadraticKinetic,

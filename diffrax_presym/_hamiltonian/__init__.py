@@ -24,6 +24,7 @@ from ._mirror import (
     MirrorMap as MirrorMap,
     PNormMirror as PNormMirror,
 )
+from ._pairwise import pairwise_potential as pairwise_potential
 from ._potential import QuadraticPotential as QuadraticPotential
 from ._scaling import (
     AbstractScaling as AbstractScaling,

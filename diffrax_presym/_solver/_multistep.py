@@ -29,10 +29,10 @@ from ._engine import Move, Moves, Span, Stage
 from ._multistep_tables import (
     check_rho,
     HERMITE,
-    LOG_SCALE_NODES,
     multistep_table,
     MultistepInterpolation,
     MultistepTable,
+    QUINTIC,
     RHO,
 )
 from ._splitting import BlanesCasasRKN8
@@ -40,9 +40,9 @@ from ._splitting import BlanesCasasRKN8
 
 # The scheme of the first steps.
 _ONE_STEP = BlanesCasasRKN8()
-# The change of the rate of friction, times the square of the step, above which the
-# forces of the shared split vary too fast for the method.
-_ROUGH = 2e-3
+# The steps after a singularity of the friction in which the forces of the shared split
+# vary too fast for the method.
+_ROUGH = 32
 
 
 class _Carry(NamedTuple):
@@ -63,9 +63,11 @@ class _Carry(NamedTuple):
 class SymmetricMultistep(AbstractMoveSolver[_Carry]):
     r"""A symmetric multistep method: high order with one force evaluation per step.
 
-    8th, 10th or 12th order. One force evaluation per step. Uses the polynomial of the
-    last forces for dense/ts output, of the order of the scheme and without further
-    evaluations.
+    8th, 10th or 12th order. One force evaluation per step. Uses Hermite interpolation
+    for dense/ts output, 7th order in positions and 5th in momenta, at the cost of the
+    force and its derivative along the flow at both ends. With
+    [`diffrax_presym.ReversibleAdjoint`][] an output between two steps is a step of the
+    eighth-order scheme below, of 19 evaluations.
 
     For a kinetic energy $\tfrac12 \, p \cdot M^{-1} p$ with constant mass, any
     potential and any scalar friction, with constant steps, at errors of 1e-6 and less:
@@ -131,7 +133,8 @@ class SymmetricMultistep(AbstractMoveSolver[_Carry]):
             own with $k$ = `order` steps, the first half including the middle one, with
             $\alpha_0 = 1$. Its $\beta_j$ follow from the conditions of order. For
             example `(1, -2, 2, -2, 2)` is method 8A of Quinlan (1999). Defaults to
-            `None`, the method of this order of Quinlan and Tremaine (1990).
+            `None`: for orders 8 and 10, coefficients of this package, from
+            `benchmarks/multistep.py`; for order 12, Quinlan and Tremaine (1990).
 
         **Raises:**
 
@@ -214,14 +217,13 @@ class SymmetricMultistep(AbstractMoveSolver[_Carry]):
         start: tuple[State, _Carry],
         t: Array,
     ) -> State:
-        h = self.step_length(t0, t1)
-        y, carry, _ = self.advance(system, t0, t1, h, *start)
-        info = self.dense_info(system, t0, t1, h, start, (y, carry))
-        return MultistepInterpolation(t0=t0, t1=t1, **info).evaluate(t)
+        # A shorter step is always one of the one-step scheme.
+        h = self.step_length(t0, t)
+        return _ONE_STEP.advance(system, t0, t, h, start[0], None)[0]
 
     def dense_info(self, system: System, t0, t1, h, start, end) -> dict[str, PyTree]:
         step = _Step(system, self.split(system), self.table, Span(t0, t1, h))
-        return step.dense_info(start, end)
+        return step.dense_info(start[0], end[0])
 
 
 class _Step:
@@ -235,7 +237,9 @@ class _Step:
         system, split, decay = self.system, self.split, self._decay
         known = lax.stop_gradient(self._known(old))
         starting = known < self.table.order - 1
-        q, p = _to_sums(y, old)
+        lasting = old.count > self.table.order - 1
+        nothing = jtu.tree_map(jnp.zeros_like, old.p_lost)
+        q, p = _to_sums(y, old.q_lost, _pick(lasting, nothing, old.p_lost))
         # A kick by the filtered force, and a drift.
         newest = float(self.table.forces[0])
         kick = jtu.tree_map(lambda s, f: s[0] + newest * f, old.filter, old.force)
@@ -264,14 +268,11 @@ class _Step:
         filter = jtu.tree_map(remember, decay(old.filter), force, values(kick))
         force = split.force(system, t1, (q, momentum))
         p1 = self._momentum(t1, h, q, momentum, force, filter)
-        pick = lambda x, y: jtu.tree_map(partial(jnp.where, starting), x, y)
-        first_step = known == self.table.order - 1
-        kept = jtu.tree_map(partial(jnp.where, first_step), values(p), old.p_lost)
-        lost = rounding_errors(first_p)
-        p1 = jtu.tree_map(
-            Sum, pick(values(first_p), p1), pick(lost, system.zeros(lost))
-        )
-        lost = rounding_errors(q), pick(lost, kept)
+        kept = _pick(known == self.table.order - 1, values(p), old.p_lost)
+        p_lost = rounding_errors(first_p)
+        p1 = _pick(starting, (values(first_p), p_lost), (p1, nothing))
+        p1 = jtu.tree_map(Sum, *p1)
+        lost = rounding_errors(q), _pick(starting, p_lost, kept)
         new = _Carry(known + 1, cast_to(h, old.h), *lost, momentum, force, filter)
         return _from_sums((q, p1), y), new
 
@@ -280,7 +281,8 @@ class _Step:
         system, split, decay = self.system, self.split, self._decay
         known = new.count - 1
         starting = known < self.table.order - 1
-        q, p = _to_sums(y, new)
+        nothing = jtu.tree_map(jnp.zeros_like, new.p_lost)
+        q, p = _to_sums(y, new.q_lost, _pick(starting, new.p_lost, nothing))
         z = split.drift(system, t1, h, (q, new.momentum), self.table.order)
         force = split.force(system, t0, z)
         # The oldest force and kick have left the filter, so its last entry is known.
@@ -294,9 +296,8 @@ class _Step:
         filter = jtu.tree_map(forget, filter, force, kick)
         momentum = system.add(z[1], h, kick)
         p0 = self._momentum(t0, -h, z[0], momentum, force, filter)
-        pick = lambda condition, x, y: jtu.tree_map(partial(jnp.where, condition), x, y)
         first_step = known == self.table.order - 1
-        p0 = pick(first_step, new.p_lost, p0)
+        p0 = _pick(first_step, new.p_lost, p0)
 
         def start(_):
             moves = _ONE_STEP.moves(system).inverse
@@ -307,10 +308,10 @@ class _Step:
         taken = _either(starting, start, lambda taken: taken, taken)
         q, p = _unstack(taken)
         # The rounding error of a momentum not computed by the one-step scheme is zero.
-        kept = pick(starting | first_step, rounding_errors(p), new.p_lost)
+        kept = _pick(starting | first_step, rounding_errors(p), new.p_lost)
         lost = rounding_errors(q), kept
         # The rest of the history is of no use in the steps at the start.
-        rest = pick(starting, new[4:], (momentum, force, filter))
+        rest = _pick(starting, new[4:], (momentum, force, filter))
         old = _Carry(jnp.maximum(known, 0), cast_to(-h, new.h), *lost, *rest)
         return _from_sums((q, p), y), old
 
@@ -321,12 +322,12 @@ class _Step:
         change = jnp.abs(h - carry.h)
         same = (change <= 8 * ulp) & (change <= 1e-3 * jnp.abs(h))
         known = jnp.where(same, carry.count, 0)
-        half = self.split.half
-        if half is None:
+        half, friction = self.split.half, self.system.friction
+        if half is None or friction is None or friction.is_singular(t0) is None:
             return known
-        _, change = jax.jvp(half.rate, (t0,), (jnp.ones_like(t0),))
+        rate, change = jax.jvp(half.rate, (t0,), (jnp.ones_like(t0),))
         # False also where it is not a number, at a singularity.
-        smooth = jnp.abs(change) * h**2 <= _ROUGH
+        smooth = _ROUGH * jnp.abs(change * h) <= jnp.abs(rate)
         return jnp.where(smooth, known, -1)
 
     def _decay(self, x: PyTree) -> PyTree:
@@ -348,53 +349,47 @@ class _Step:
         z = values(q), tree_add(values(momentum), h, gained)
         return self.split.from_split(self.system, t, z)[1]
 
-    def dense_info(self, start, end) -> dict[str, PyTree]:
-        ((y0, _), (y1, carry)), (t0, t1, h) = (start, end), self.span
-        system, half = self.system, self.split.half
-        size = self.table.order - 1
+    def dense_info(self, y0: State, y1: State) -> dict[str, PyTree]:
+        system, (t0, t1, h) = self.system, self.span
+        mean = tree_scale(1 / h, self._times_mass(tree_sub(y1[0], y0[0])))
+        slope0, slope1 = system.slope(t0, y0)[1], system.slope(t1, y1)[1]
+        friction = system.friction
+        singular = None if friction is None else friction.is_singular(t0)
+        # There is no second derivative at a singularity of the friction.
+        regular = (t0, y0) if singular is None else _pick(singular, (t1, y1), (t0, y0))
 
-        def at_start(_):
-            # From derivatives at both ends; without friction in the frame.
-            jets = []
-            for t, y in ((t1, y1), (t0, y0)):
-                slope = system.slope(t, y)
-                along = jnp.ones_like(t), slope
-                second = jax.jvp(system.slope, (t, y), along)[1]
-                jets += [y[1], tree_scale(h, slope[1]), tree_scale(h**2, second[1])]
-            mean = tree_scale(1 / h, self._times_mass(tree_sub(y1[0], y0[0])))
+        def second(t, y):
+            along = jnp.ones_like(t), system.slope(t, y)
+            return jax.jvp(system.slope, (t, y), along)[1][1]
 
-            def leaf(*rows):
-                slopes = _product(HERMITE, jnp.stack(rows))
-                zeros = jnp.zeros_like(slopes[:1])
-                return jnp.concatenate([slopes, *[zeros] * (size - len(slopes))])
+        def leaf(p1, slope1, second1, p0, slope0, second0, mean):
+            step = cast_to(h, p0)
+            first = p1, step * slope1, step**2 * second1, p0, step * slope0
+            jet = step**2 * second0
+            if singular is not None:
+                # Instead, the polynomial is of one degree less.
+                *weights, unknown, of_mean = HERMITE[-1].tolist()
+                rest = sum(c * x for c, x in zip(weights, first, strict=True))
+                jet = jnp.where(singular, -(rest + of_mean * mean) / unknown, jet)
+            return jnp.stack([*first, jet, mean])
 
-            return mean, jtu.tree_map(leaf, *jets, mean), jnp.zeros(6, h.dtype)
-
-        def later(_):
-            def leaf(s, force):
-                rows = jnp.concatenate([s, force[None]])
-                return cast_to(h, s) * _product(self.table.derivatives, rows)
-
-            slopes = jtu.tree_map(leaf, carry.filter, carry.force)
-            if half is None:
-                return values(carry.momentum), slopes, jnp.zeros(6, h.dtype)
-            back = -cast_to(LOG_SCALE_NODES, h) * h
-            scale = jax.vmap(partial(half.increment, t1))(back)
-            return values(carry.momentum), slopes, cast_to(scale, h)
-
-        starting = carry.count < self.table.order
-        mean, slopes, scale = _either(starting, at_start, later, None)
-        velocity = lambda p: system.velocity(t1, (y1[0], p))
-        info = dict(
-            y0=y0,
-            y1=y1,
-            mean=(tree_scale(h, velocity(mean)), mean),
-            derivatives=(tree_scale(h, jax.vmap(velocity)(slopes)), slopes),
+        rows = jtu.tree_map(
+            leaf,
+            *(y1[1], slope1, second(t1, y1)),
+            *(y0[1], slope0, second(*regular)),
+            mean,
         )
-        if half is not None:
-            moment = tree_scale(1 / h, self._times_mass(y1[0]))
-            info |= dict(log_scale=scale, moment=moment)
-        return info
+        # Momenta without the mean, in which differences of positions are amplified.
+        p = jtu.tree_map(lambda x: _product(QUINTIC, x[:-1]), rows)
+        integrals = HERMITE / np.arange(1, 8)[:, None]
+        velocity = jax.vmap(lambda p: system.velocity(t1, (y1[0], p)))
+        dq = velocity(jtu.tree_map(lambda x: _product(integrals, x), rows))
+        dq = tree_scale(h, dq)
+        return dict(y0=y0, y1=y1, coefficients=(dq, p))
+
+
+def _pick(condition: Bool[Array, ""], x: PyTree, y: PyTree) -> PyTree:
+    return jtu.tree_map(partial(jnp.where, condition), x, y)
 
 
 def _outer(column: np.ndarray, x: Array) -> Array:
@@ -422,10 +417,9 @@ def _as_sums(x: PyTree) -> PyTree[Sum]:
     return jtu.tree_map(lambda x: Sum(x, jnp.zeros_like(x)), x)
 
 
-def _to_sums(y: State, carry: _Carry) -> State:
+def _to_sums(y: State, *lost: PyTree) -> State:
     # Within `Compensated` the leaves are sums already.
     leaf = lambda x, lost: x if is_sum(x) else Sum(x, lost)
-    lost = carry.q_lost, carry.p_lost
     return jtu.tree_map(leaf, y, lost, is_leaf=is_sum)
 
 

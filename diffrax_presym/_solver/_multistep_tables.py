@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
@@ -16,14 +15,33 @@ from .._interpolation import AbstractStepInterpolation
 from .._misc import cast_to
 
 
-# Published methods: the coefficients of rho up to the middle one. They determine the
-# method, as sigma follows from the conditions of order.
-# Quinlan and Tremaine (1990), and method 8A of Quinlan (1999).
+# The coefficients of rho up to the middle one. They determine the method, as sigma
+# follows from the conditions of order. Quinlan and Tremaine (1990), and 8A of Quinlan
+# (1999):
 QUINLAN_TREMAINE_8 = (1, -2, 2, -1, 0)
 QUINLAN_8A = (1, -2, 2, -2, 2)
 QUINLAN_TREMAINE_10 = (1, -1, 1, -1, 1, -2)
 QUINLAN_TREMAINE_12 = (1, -2, 2, -1, 0, 0, 0)
-RHO = {8: QUINLAN_TREMAINE_8, 10: QUINLAN_TREMAINE_10, 12: QUINLAN_TREMAINE_12}
+
+
+def _from_cosines(*twice: str) -> tuple[Fraction, ...]:
+    """rho with a double root at one, and others given by twice their cosines."""
+    rho = [Fraction(1), Fraction(-2), Fraction(1)]
+    for c in map(Fraction, twice):
+        padded = [Fraction(0)] * 2 + rho + [Fraction(0)] * 2
+        terms = zip(padded[2:], padded[1:-1], padded[:-2], strict=True)
+        rho = [x - c * y + z for x, y, z in terms]
+    return tuple(rho[: len(rho) // 2 + 1])
+
+
+_PUBLISHED = {8: QUINLAN_TREMAINE_8, 10: QUINLAN_TREMAINE_10, 12: QUINLAN_TREMAINE_12}
+# Chosen in `benchmarks/multistep.py`, for few steps that resonate or are unstable on
+# Kepler orbits.
+RHO = {
+    8: _from_cosines("0.8516", "-0.2157", "-1.6290"),
+    10: _from_cosines("1.4191", "0.6472", "-0.5899", "-1.6846"),
+    12: QUINLAN_TREMAINE_12,
+}
 
 
 def check_rho(order: int, rho: Sequence[float]) -> tuple[float, ...]:
@@ -34,13 +52,13 @@ def check_rho(order: int, rho: Sequence[float]) -> tuple[float, ...]:
     except TypeError:
         raise ValueError(
             f"{name} needs a sequence of numbers, but got {rho!r}. For example "
-            f"`rho={RHO[order]}`."
+            f"`rho={_PUBLISHED[order]}`."
         ) from None
     if len(rho) != order // 2 + 1 or rho[0] != 1:
         raise ValueError(
             f"{name} of order {order} needs {order // 2 + 1} coefficients up to the "
             f"middle one, the first of which is 1, but got {rho}. For example "
-            f"`rho={RHO[order]}`."
+            f"`rho={_PUBLISHED[order]}`."
         )
     everything = np.array([*rho, *rho[-2::-1]])
     kicks, rest = np.polydiv(everything, [1.0, -2.0, 1.0])
@@ -51,7 +69,7 @@ def check_rho(order: int, rho: Sequence[float]) -> tuple[float, ...]:
         raise ValueError(
             f"{name} needs a double root at one and all other roots simple and on the "
             f"unit circle, but the roots of {rho} are not. For example "
-            f"`rho={RHO[order]}`."
+            f"`rho={_PUBLISHED[order]}`."
         )
     return rho
 
@@ -66,10 +84,8 @@ class MultistepTable(NamedTuple):
     order: int
     forces: np.ndarray  # sigma, without its two zeros
     kicks: np.ndarray  # R
-    # Row j is the derivative of order j of the force, times the power j of the step,
-    # from the state of the filter and the newest force.
-    derivatives: np.ndarray
-    # The momentum at a step, less that of the step before it, over h: from the same.
+    # The momentum at a step less its mean over the step, divided by the length of the
+    # step: from the state of the filter and the newest force.
     momentum: np.ndarray
 
 
@@ -77,13 +93,9 @@ class MultistepTable(NamedTuple):
 def multistep_table(rho: tuple) -> MultistepTable:
     """The table of a method, computed in rational arithmetic and rounded once."""
     kicks, forces = exact_coefficients(rho)
-    derivatives = _derivatives(kicks, forces)
-    count = len(derivatives)
-    weights = [Fraction((-1) ** j, math.factorial(j + 2)) for j in range(count)]
-    momentum = [_dot(weights, column) for column in zip(*derivatives, strict=True)]
-    return MultistepTable(
-        count + 1, *(np.array(x, float) for x in (forces, kicks, derivatives, momentum))
-    )
+    momentum = _momentum(kicks, forces)
+    columns = (np.array(x, float) for x in (forces, kicks, momentum))
+    return MultistepTable(len(kicks) + 1, *columns)
 
 
 def exact_coefficients(rho: Sequence) -> tuple[list[Fraction], list[Fraction]]:
@@ -112,9 +124,10 @@ def exact_coefficients(rho: Sequence) -> tuple[list[Fraction], list[Fraction]]:
     return kicks, middle[:0:-1] + middle
 
 
-def _derivatives(kicks: list[Fraction], forces: list[Fraction]):
-    # In powers of w, for forces exp(w t / h): the kick is 2 (cosh(w) - 1) / w^2, and an
-    # entry of the state of the filter what past forces and kicks add to a later kick.
+def _momentum(kicks: list[Fraction], forces: list[Fraction]) -> list[Fraction]:
+    # For the force exp(w t / h), in powers of w: the kick is 2 (cosh(w) - 1) / w^2, an
+    # entry of the state of the filter is what past forces and kicks add to a later
+    # kick, and the momentum less its mean over the step is 1 / w - (1 - exp(-w)) / w^2.
     count = len(kicks)
     kick = [Fraction(1 - j % 2) * 2 / math.factorial(j + 2) for j in range(count)]
 
@@ -132,8 +145,8 @@ def _derivatives(kicks: list[Fraction], forces: list[Fraction]):
         state.append(total)
     newest = [Fraction(int(j == 0)) for j in range(count)]
     columns = list(zip(*state, newest, strict=True))
-    identity = [[Fraction(int(i == j)) for j in range(count)] for i in range(count)]
-    return list(zip(*_solve(columns, identity), strict=True))
+    wanted = [[Fraction((-1) ** j, math.factorial(j + 2))] for j in range(count)]
+    return [x for (x,) in _solve(columns, wanted)]
 
 
 def _dot(x, y) -> Fraction:
@@ -157,95 +170,41 @@ def _solve(matrix, right) -> list[list[Fraction]]:
     return [row[size:] for row in rows]
 
 
-# Nodes of the interpolation of a log scale within a step, backwards from its end.
-LOG_SCALE_NODES = np.arange(1, 7) / 6
-_LOG_SCALE = np.linalg.inv(LOG_SCALE_NODES[:, None] ** np.arange(1, 7))
+def _hermite(size: int) -> np.ndarray:
+    """From the momentum and its first two derivatives, at the end and at the start of a
+    step, and perhaps its mean, to its polynomial in the fraction of the step."""
+    powers = np.arange(size)
+    start, end = np.eye(size)[:3], np.ones((3, size))
+    start[2] *= 2
+    end[1], end[2] = powers, powers * (powers - 1)
+    rows = np.concatenate([end, start, 1 / (powers + 1)[None]])
+    return np.linalg.inv(rows[:size])
 
 
-def _hermite() -> np.ndarray:
-    """From the momentum and its first two derivatives at both ends, and its mean, to
-    the derivatives of the force at the end."""
-    powers = np.arange(7)
-    last, first = np.eye(7)[:3], np.ones((3, 7))
-    first[1] = powers
-    first[2] = powers * (powers - 1)
-    last[2] *= 2
-    # The derivative with respect to time is minus that backwards from the end.
-    signs = np.array([1, -1, 1])[:, None]
-    rows = [signs * last, signs * first, 1 / (powers + 1)[None]]
-    factors = [-((-1) ** j) * math.factorial(j + 1) for j in range(6)]
-    return np.array(factors)[:, None] * np.linalg.inv(np.concatenate(rows))[1:]
-
-
-HERMITE = _hermite()
+HERMITE, QUINTIC = _hermite(7), _hermite(6)
 
 
 class MultistepInterpolation(AbstractStepInterpolation):
-    """The polynomial of a step with the derivatives of the force at its end.
+    """Hermite interpolation from a position and three derivatives at both ends, and
+    from a momentum and two derivatives.
 
-    Exact at both ends, and of the order of the method between them: in the variables
-    of the shared split, in which the method steps.
+    Exact at both ends, with errors of eighth and sixth order in the length of the step.
     """
 
     t0: PyTree
     t1: PyTree
     y0: PyTree
     y1: PyTree
-    # The mean slope, times the length of the step.
-    mean: PyTree
-    # The derivatives of the slope at the end, times powers of the length of the step.
-    derivatives: PyTree
-    # Half the log scale at the nodes less that at the end, and the mass times the
-    # position at the end over the length of the step; with friction only.
-    log_scale: Array | None = None
-    moment: PyTree = None
+    # The coefficients of the change of the position and of the momentum, stacked.
+    coefficients: PyTree
 
     def at_fraction(self, s: Array) -> PyTree:
-        q, p = self._curve(s)
-        # The momentum at the start has an error of its own.
-        miss = jtu.tree_map(jnp.subtract, self.y0[1], self._curve(jnp.zeros_like(s))[1])
-        weight = (1 - s) ** 2 * (1 + 2 * s)
-        fix = lambda p, miss: p + cast_to(weight, p) * miss
-        return q, jtu.tree_map(fix, p, miss)
+        (q, _), (dq, p) = self.y0, self.coefficients
 
-    def _curve(self, s: Array) -> PyTree:
-        back = 1 - s
-        (dq, dp), (ddq, ddp) = self.mean, self.derivatives
+        def leaf(coefficients):
+            # Horner's rule.
+            x = cast_to(s, coefficients)
+            return functools.reduce(lambda y, c: y * x + c, coefficients[::-1])
 
-        def position(x1, mean, slopes):
-            r = cast_to(back, x1)
-            weights = _weights(r, len(slopes), 2)
-            terms = (w * x for w, x in zip(weights, slopes, strict=True))
-            return functools.reduce(jnp.add, terms, x1 - r * mean)
-
-        def momentum(mean, slopes):
-            weights = _weights(cast_to(back, mean), len(slopes), 1)
-            terms = (w * x for w, x in zip(weights, slopes, strict=True))
-            return functools.reduce(jnp.subtract, terms, mean)
-
-        q = jtu.tree_map(position, self.y1[0], dq, ddq)
-        p = jtu.tree_map(momentum, dp, ddp)
-        if self.log_scale is None:
-            return q, p
-        coefficients = cast_to(_LOG_SCALE, self.log_scale) @ self.log_scale
-        terms = list(enumerate(coefficients, 1))
-        scale = jnp.exp(-sum((c * back**n for n, c in terms), jnp.zeros_like(back)))
-        rate = sum((n * c * back ** (n - 1) for n, c in terms), jnp.zeros_like(back))
-        moment = jtu.tree_map(position, self.moment, dp, ddp)
-        leaf = lambda p, m: cast_to(scale, p) * (p + cast_to(rate, p) * m)
-        return (
-            jtu.tree_map(lambda q: cast_to(scale, q) * q, q),
-            jtu.tree_map(leaf, p, moment),
-        )
-
-
-def _weights(r, count: int, integrals: int) -> list:
-    """The Taylor polynomials of the slope, integrated once or twice from both ends."""
-    weights = []
-    for j in range(count):
-        factor = (-1) ** j / math.factorial(j + 2)
-        if integrals == 2:
-            weights.append(factor * (r ** (j + 2) - r))
-        else:
-            weights.append(factor * ((j + 2) * r ** (j + 1) - 1))
-    return weights
+        scaled = lambda dq: cast_to(s, dq) * leaf(dq)
+        return jtu.tree_map(lambda q, dq: q + scaled(dq), q, dq), jtu.tree_map(leaf, p)
