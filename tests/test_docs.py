@@ -31,8 +31,7 @@ PUBLIC = {
 PUBLIC |= {
     f"diagnostics.{name}": value
     for name, value in vars(dps.diagnostics).items()
-    if not name.startswith("_")
-    and ".diagnostics." in getattr(value, "__module__", "")
+    if not name.startswith("_") and ".diagnostics." in getattr(value, "__module__", "")
 }
 REFERENCE = re.compile(
     r"\[`?(diffrax_presym\.[\w.]+)`?\]\[|\]\[(diffrax_presym\.[\w.]+)\]"

@@ -168,19 +168,19 @@ def _leafwise(method: Callable) -> Callable:
     """A method of a law; leaf by leaf where its parameters are pytrees."""
 
     @functools.wraps(method)
-    def mapped(self, *args):
+    def mapped(self, *args, **kwargs):
         names = [field.name for field in dataclasses.fields(self)]
         parameters = [getattr(self, name) for name in names]
         trees = [x for x in parameters if not is_leaf(x)]
         if not trees:
-            return method(self, *args)
+            return method(self, *args, **kwargs)
         structure = jtu.tree_structure(trees[0])
         leaves = [
             [x] * structure.num_leaves if is_leaf(x) else structure.flatten_up_to(x)
             for x in parameters
         ]
         laws = [type(self)(*x) for x in zip(*leaves, strict=True)]
-        return structure.unflatten([method(law, *args) for law in laws])
+        return structure.unflatten([method(law, *args, **kwargs) for law in laws])
 
     return mapped
 
