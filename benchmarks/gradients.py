@@ -4,8 +4,9 @@ The leapfrog, on damped pendulums, whose sines take most of the time, and on spr
 with a cubic force, which takes almost none. A ratio is the time of value and gradient,
 with respect to the initial state and the damping, over that of the same solve alone.
 `ReversibleAdjoint` is compared with Diffrax's `RecursiveCheckpointAdjoint`, its
-default, and with reverse mode through a `lax.scan` written by hand, whose number of
-steps is fixed when it is compiled. Runs that would take too long or too much memory are
+default, with `FixedStepAdjoint` in batches, and with reverse mode through a `lax.scan`
+written by hand, whose number of steps is fixed when it is compiled.
+Runs that would take too long or too much memory are
 omitted, and those of minutes are made once.
 
 Memory is what XLA reports that the compiled program needs in addition to its arguments.
@@ -29,6 +30,11 @@ jax.config.update("jax_enable_x64", True)
 T1 = 10.0
 REVERSIBLE = dps.ReversibleAdjoint()
 CHECKPOINTED = dfx.RecursiveCheckpointAdjoint()
+ADJOINTS = {
+    "reversible": REVERSIBLE,
+    "fixed step": dps.FixedStepAdjoint(),
+    "checkpointed": CHECKPOINTED,
+}
 # Steps times unknowns beyond which a method is not tried.
 MOST = {"reversible": 1e10, "checkpointed": 2e7, "scan": 3e7}
 LONG = 3e8  # Beyond which a program runs once, without a warm-up.
@@ -121,6 +127,62 @@ def times(system, sizes, counts, repeats):
             table.row(n, steps, alone.median * 1e3, *ratios)
 
 
+def batches(sizes, counts, repeats):
+    """Under `vmap`, saving the end or at 101 times, of one pendulum each."""
+    table = Table(
+        "Value and gradient over the solve alone, batches of pendulums",
+        "batch:>7",
+        "steps:>7",
+        "saved:>5",
+        "solve, ms:>10.3g",
+        *(f"{name}:>13.2f" for name in ADJOINTS),
+        "checkpointed / reversible:>26.1f",
+    )
+    hamiltonian = lambda gamma: dps.ConformalHamiltonian(
+        dps.QuadraticKinetic(), SYSTEMS["pendulums"], dps.ConstantDamping(gamma)
+    )
+
+    def loss(adjoint, steps, saveat, q, gamma):
+        sol = solve(
+            hamiltonian(gamma),
+            dps.PresymplecticLeapfrog(),
+            *(0.0, T1, T1 / steps, (q, jnp.zeros_like(q))),
+            saveat=saveat,
+            adjoint=adjoint,
+            max_steps=steps,
+        )
+        return sum(jnp.sum(y**2) for y in sol.ys)
+
+    saves = {
+        "t1": dfx.SaveAt(t1=True),
+        "101": dfx.SaveAt(ts=jnp.linspace(0.0, T1, 101)),
+    }
+    for batch in sizes:
+        for steps in counts:
+            if batch * steps > 1e7:
+                continue
+            q, gamma = jnp.linspace(0.5, 2.0, batch)[:, None], jnp.array(0.1)
+            for name, saveat in saves.items():
+                programs = {}
+                for key, adjoint in {"solve": REVERSIBLE, **ADJOINTS}.items():
+                    fn = functools.partial(loss, adjoint, steps, saveat)
+                    if key != "solve":
+                        fn = jax.value_and_grad(fn, argnums=(0, 1))
+                    fn = jax.jit(jax.vmap(fn, in_axes=(0, None)))
+                    fn = fn.lower(q, gamma).compile()
+                    if key != "checkpointed" or batch * steps <= 1e6:
+                        programs[key] = functools.partial(fn, q, gamma)
+                found = interleaved(programs, repeats)
+                alone = found["solve"]
+                ratios = [
+                    found[x].over(alone) if x in found else None for x in ADJOINTS
+                ]
+                last_ratio = None
+                if "checkpointed" in found:
+                    last_ratio = found["checkpointed"].over(found["reversible"])
+                table.row(batch, steps, name, alone.median * 1e3, *ratios, last_ratio)
+
+
 def memory(n, counts):
     title = f"Memory of value and gradient at {n} unknowns, MB"
     table = Table(title, "steps:>9", *(f"{name}:>13.3f" for name in MOST))
@@ -131,12 +193,21 @@ def memory(n, counts):
 
 
 def main():
-    quick = command_line(__doc__).parse_args().quick
+    parser = command_line(__doc__)
+    parser.add_argument("--batches", action="store_true", help="only the batches")
+    options = parser.parse_args()
+    quick = options.quick
     repeats = 2 if quick else 5
     print(f"{jax.devices()[0].device_kind}, median of {repeats} runs")
     sizes, counts = (1, 1000, 100000), (1000, 10000, 100000)
     if quick:
         sizes, counts = (1,), (1000,)
+    if quick:
+        batches((1, 64), (100,), repeats)
+    else:
+        batches((1, 64, 4096), (1000, 10_000), repeats)
+    if options.batches:
+        return
     for system in SYSTEMS:
         times(system, sizes, counts, repeats)
     memory(1000, (1000, 10000) if quick else (1000, 10000, 100000, 1000000))
