@@ -1,6 +1,7 @@
 """Symmetric multistep methods."""
 
 from fractions import Fraction
+from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
@@ -103,6 +104,11 @@ CASES = [(order, "logarithmic") for order in ORDERS]
 CASES += [(8, law) for law in LAWS if law != "logarithmic"]
 
 
+def ends(*args, **options) -> Any:
+    """What a solve saves, by default the final state."""
+    return solve(*args, **options).ys
+
+
 def largest(x, y):
     pairs = zip(jax.tree.leaves(x), jax.tree.leaves(y), strict=True)
     return max(float(jnp.max(jnp.abs(a - b))) for a, b in pairs)
@@ -112,10 +118,10 @@ def largest(x, y):
 def test_order(order, law):
     hamiltonian, solver = system(LAWS[law]), dps.SymmetricMultistep(order)
     assert solver.order(None) == order
-    exact = solve(hamiltonian, EXACT, 1.0, 13.0, 0.05, Y0, ONE).ys
+    exact = ends(hamiltonian, EXACT, 1.0, 13.0, 0.05, Y0, ONE)
     counts = (128, 200)
     errors = [
-        largest(solve(hamiltonian, solver, 1.0, 13.0, 12 / n, Y0, ONE).ys, exact)
+        largest(ends(hamiltonian, solver, 1.0, 13.0, 12 / n, Y0, ONE), exact)
         for n in counts
     ]
     measured = np.log(errors[0] / errors[1]) / np.log(counts[1] / counts[0])
@@ -130,14 +136,14 @@ def test_backwards_in_time_and_any_mass():
         hamiltonian = dps.ConformalHamiltonian(kinetic, henon_heiles, damping)
         y0 = jax.tree.map(lambda x: x / 4, Y0)
         args = hamiltonian, dps.SymmetricMultistep(8), 10.0, 4.0, -0.05, y0
-        exact = solve(hamiltonian, EXACT, *args[2:]).ys
-        assert_close(solve(*args).ys, exact, 1e-9)
+        exact = ends(hamiltonian, EXACT, *args[2:])
+        assert_close(ends(*args), exact, 1e-9)
 
 
 def test_first_steps_after_a_singularity_are_those_of_the_other_scheme():
     hamiltonian = system(dps.LogDamping(3.0))
     y0 = Y0[0], jnp.zeros(2)
-    end = lambda solver: solve(hamiltonian, solver, 0.0, 20.0, 0.1, y0, ONE).ys
+    end = lambda solver: ends(hamiltonian, solver, 0.0, 20.0, 0.1, y0, ONE)
     assert_close(end(dps.SymmetricMultistep(10)), end(dps.BlanesCasasRKN8()), 1e-9)
 
 
@@ -203,11 +209,11 @@ def test_gradients_by_reversal_are_those_by_checkpoints(law):
     def gradients(adjoint):
         def loss(inputs):
             y0, args = inputs
-            ys = solve(
+            ys = ends(
                 *(hamiltonian, dps.SymmetricMultistep(8), 1.0, 5.0, 0.1, y0, args),
                 saveat=saveat,
                 adjoint=adjoint,
-            ).ys
+            )
             return jnp.sum(ys[0] ** 2) + jnp.sum(ys[0] * ys[1])
 
         return jax.value_and_grad(loss)((Y0, ONE))
@@ -221,7 +227,7 @@ def test_gradient_is_that_of_finite_differences():
 
     def loss(args):
         adjoint = dps.ReversibleAdjoint()
-        ys = solve(hamiltonian, solver, 0.0, 4.0, 0.1, Y0, args, adjoint=adjoint).ys
+        ys = ends(hamiltonian, solver, 0.0, 4.0, 0.1, Y0, args, adjoint=adjoint)
         return jnp.sum(ys[0] * ys[1])
 
     up, down = loss(ONE + 1e-5), loss(ONE - 1e-5)
@@ -237,10 +243,10 @@ def test_a_change_of_the_step_starts_again():
     term, controller = dps.HamiltonianTerm(hamiltonian), dfx.StepTo(ts)
     args = term, solver, 0.0, 5.0, None, Y0, ONE
     end = dfx.diffeqsolve(*args, stepsize_controller=controller).ys
-    exact = solve(hamiltonian, EXACT, 0.0, 5.0, 0.05, Y0, ONE).ys
+    exact = ends(hamiltonian, EXACT, 0.0, 5.0, 0.05, Y0, ONE)
     assert_close(end, exact, 1e-9)
     # With a history that is not made anew, the error would be of the order of one.
-    uneven = solve(hamiltonian, solver, 0.0, 5.0, 0.107, Y0, ONE).ys
+    uneven = ends(hamiltonian, solver, 0.0, 5.0, 0.107, Y0, ONE)
     assert_close(uneven, exact, 1e-9)
 
 
@@ -266,8 +272,8 @@ def test_a_jump_starts_again():
         return jax.lax.scan(one, start, jnp.arange(40).astype(float))[0][0]
 
     last = lambda ys: jax.tree.map(lambda x: x[-1], ys)
-    half = last(solve(hamiltonian, EXACT, 0.0, 2.0, 0.05, Y0, before).ys)
-    exact = last(solve(hamiltonian, EXACT, 2.0, 4.0, 0.05, half, after).ys)
+    half = last(ends(hamiltonian, EXACT, 0.0, 2.0, 0.05, Y0, before))
+    exact = last(ends(hamiltonian, EXACT, 2.0, 4.0, 0.05, half, after))
     assert_close(walk(Y0, True), exact, 1e-8)
     assert largest(walk(Y0, False), exact) > 1e-3
 
@@ -276,9 +282,9 @@ def test_events():
     hamiltonian, solver = system(LAWS["constant"]), dps.SymmetricMultistep(8)
     cond = lambda t, y, args, **kwargs: y[0][0]
     event = dfx.Event(cond, optx.Newton(1e-11, 1e-11))
-    sol = solve(hamiltonian, solver, 0.0, 9.0, 0.05, Y0, ONE, event=event)
+    sol: Any = solve(hamiltonian, solver, 0.0, 9.0, 0.05, Y0, ONE, event=event)
     assert sol.result == dfx.RESULTS.event_occurred
-    end = solve(hamiltonian, EXACT, 0.0, sol.ts[-1], 0.05, Y0, ONE).ys
+    end = ends(hamiltonian, EXACT, 0.0, sol.ts[-1], 0.05, Y0, ONE)
     assert abs(float(end[0][-1, 0])) < 1e-9
     assert_close(sol.ys, end, 1e-8)
 
@@ -292,18 +298,18 @@ def test_between_steps_the_error_is_that_at_steps(law):
     saveat = dfx.SaveAt(ts=jnp.linspace(1.0, 6.0, 1 + 160))
     args = 1.0, 6.0, 0.125, Y0, ONE
     options = dict(saveat=saveat, adjoint=dps.ReversibleAdjoint())
-    exact = solve(hamiltonian, EXACT, *args, **options).ys
-    ys = solve(hamiltonian, solver, *args, **options).ys
+    exact = ends(hamiltonian, EXACT, *args, **options)
+    ys = ends(hamiltonian, solver, *args, **options)
     for y, true in zip(ys, exact, strict=True):
         errors = np.max(np.abs(y - true), axis=1)
         assert np.max(errors) < 1.5 * np.max(errors[::4]) < 1e-6
     # The same from the interpolation of Diffrax, exact at both ends.
-    slow = solve(hamiltonian, solver, *args, saveat=saveat).ys
+    slow = ends(hamiltonian, solver, *args, saveat=saveat)
     assert_close(slow, ys, 1e-7)
     both = dfx.SaveAt(dense=True, steps=True)
-    dense = solve(hamiltonian, solver, *args, saveat=both)
-    ends = jax.vmap(dense.evaluate)(dense.ts[:40])
-    assert_close(ends, jax.tree.map(lambda x: x[:40], dense.ys), 1e-12)
+    dense: Any = solve(hamiltonian, solver, *args, saveat=both)
+    at_ends = jax.vmap(dense.evaluate)(dense.ts[:40])
+    assert_close(at_ends, jax.tree.map(lambda x: x[:40], dense.ys), 1e-12)
 
 
 def test_vmap():
@@ -313,7 +319,7 @@ def test_vmap():
         y0 = jax.tree.map(lambda x: scale * x, Y0)
         one = eqx.tree_at(lambda h: h.damping.gamma, hamiltonian, gamma)
         # Some in the batch are at the start while others are not.
-        return solve(one, solver, t0, 4.0, 0.1, y0, ONE).ys
+        return ends(one, solver, t0, 4.0, 0.1, y0, ONE)
 
     inputs = jnp.array([0.5, 1.0]), jnp.array([0.0, 1.5]), jnp.array([1.5, 0.7])
     batch = jax.vmap(end)(*inputs)
@@ -326,21 +332,21 @@ def test_float32():
     to_single = lambda x: x.astype(jnp.float32) if eqx.is_array(x) else x
     single = lambda x: jax.tree.map(to_single, x)
     hamiltonian, solver = single(system(LAWS["constant"])), dps.SymmetricMultistep(8)
-    times = single((jnp.array(0.0), jnp.array(8.0), jnp.array(0.1)))
-    ys = solve(hamiltonian, solver, *times, single(Y0), single(ONE)).ys
+    times: Any = single((jnp.array(0.0), jnp.array(8.0), jnp.array(0.1)))
+    ys = ends(hamiltonian, solver, *times, single(Y0), single(ONE))
     assert all(x.dtype == jnp.float32 for x in ys)
-    exact = solve(system(LAWS["constant"]), EXACT, 0.0, 8.0, 0.05, Y0, ONE).ys
+    exact = ends(system(LAWS["constant"]), EXACT, 0.0, 8.0, 0.05, Y0, ONE)
     assert_close(ys, exact, 3e-6)
 
 
 def test_wrappers():
     hamiltonian, solver = system(LAWS["constant"]), dps.SymmetricMultistep(8)
     args = 0.0, 4.0, 0.1, Y0, ONE
-    plain = solve(hamiltonian, solver, *args).ys
+    plain = ends(hamiltonian, solver, *args)
     for wrapped in (dps.Compensated(solver), dps.Checked(solver)):
-        assert_close(solve(hamiltonian, wrapped, *args).ys, plain, 1e-14)
+        assert_close(ends(hamiltonian, wrapped, *args), plain, 1e-14)
     substeps = dps.Substeps(solver, 2)
-    twice = solve(hamiltonian, substeps, 0.0, 4.0, 0.2, Y0, ONE).ys
+    twice = ends(hamiltonian, substeps, 0.0, 4.0, 0.2, Y0, ONE)
     assert_close(twice, plain, 1e-13)
 
 
@@ -355,7 +361,7 @@ def energy_error(order, eccentricity, per_orbit, orbits):
     ts = jnp.linspace(0, 2 * np.pi * orbits, 10 * orbits + 1)
     saveat = dfx.SaveAt(ts=ts, fn=lambda t, y, args: hamiltonian.energy(t, *y))
     options = dict(saveat=saveat, max_steps=None, adjoint=dps.ReversibleAdjoint())
-    energies = solve(hamiltonian, solver, 0.0, ts[-1], h, y0, **options).ys
+    energies = ends(hamiltonian, solver, 0.0, ts[-1], h, y0, **options)
     return np.max(np.abs(np.reshape(energies[1:] + 0.5, (10, -1))), axis=1)
 
 
@@ -370,11 +376,13 @@ def test_energy_does_not_drift(order):
 
 
 def test_bad_input():
+    order: Any
     for order in (7, 9, 14, 8.0, True):
         with pytest.raises(ValueError, match="8, 10 or 12"):
             dps.SymmetricMultistep(order)
     with pytest.raises(ValueError, match="TunedRKN6"):
         dps.SymmetricMultistep(4)
+    rho: Any
     for rho in ((1, -2, 2), (2, -2, 2, -1, 0), (1, -3, 2, -1, 0), 3, (1, -4, 6, -4, 2)):
         with pytest.raises(ValueError, match="rho"):
             dps.SymmetricMultistep(8, rho)
@@ -388,7 +396,7 @@ def test_bad_input():
             solve(hamiltonian, own, 0.0, 1.0, 0.1, Y0)
     with pytest.raises(ValueError, match="unequal steps"):
         dps.Suzuki4(own)
-    with pytest.raises(RuntimeError, match="error estimate"):
+    with pytest.raises((ValueError, RuntimeError), match="error estimate"):
         controller = dfx.PIDController(rtol=1e-6, atol=1e-6)
         args = system(None), own, 0.0, 1.0, 0.1, Y0, ONE
         solve(*args, stepsize_controller=controller)

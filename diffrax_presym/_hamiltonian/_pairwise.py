@@ -55,6 +55,7 @@ def pairwise_potential(fn: Callable, masses=None) -> Callable:
     !!! example
 
         ```python
+        masses = jnp.array([1.0, 1e-3, 3e-4])
         gravity = pairwise_potential(lambda t, r, args: -1 / r, masses)
         hamiltonian = SeparableHamiltonian(QuadraticKinetic(masses[:, None]), gravity)
         ```
