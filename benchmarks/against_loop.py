@@ -119,8 +119,8 @@ def ours(solver, potential, saved, steps):
 
 def main():
     quick = command_line(__doc__).parse_args().quick
-    repeats = 3 if quick else 15
-    sizes = {1: 100_000, 1000: 5_000, 100_000: 200}
+    repeats = 3 if quick else 9
+    sizes = {1: 20_000, 1000: 1_000, 100_000: 100}
     if quick:
         sizes = {n: max(steps // 50, OUTPUTS) for n, steps in sizes.items()}
     table = Table(

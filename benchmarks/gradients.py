@@ -151,7 +151,7 @@ def batches(sizes, counts, repeats):
             adjoint=adjoint,
             max_steps=steps,
         )
-        return sum(jnp.sum(y**2) for y in sol.ys)
+        return sum(jnp.sum(y**2) for y in jax.tree.leaves(sol.ys))
 
     saves = {
         "t1": dfx.SaveAt(t1=True),

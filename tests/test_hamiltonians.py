@@ -480,7 +480,7 @@ def test_pairwise_potential():
     hamiltonian = dps.SeparableHamiltonian(dps.QuadraticKinetic(), potential)
     assert jnp.all(jnp.isfinite(hamiltonian.force(*args[:2], q, args[2])))
     with pytest.raises(ValueError, match=r"fn\(t, r, args\)"):
-        dps.pairwise_potential(3.0)
+        dps.pairwise_potential(3.0)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="4 particles"):
         dps.pairwise_potential(fn, masses[:3])(*args)
     with pytest.raises(ValueError, match="one array"):
