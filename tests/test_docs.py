@@ -136,6 +136,7 @@ def test_docstring_is_complete(name):
 
 # Records whose fields are documented in the class docstring; not created by users.
 DOCUMENTED_AS_A_WHOLE = {
+    "ChosenStep",
     "diagnostics.WorkPrecision",
     "diagnostics.WorkPrecisionRun",
     "HermiteInterpolation",

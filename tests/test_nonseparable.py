@@ -54,14 +54,12 @@ def test_free_copies_are_more_accurate_at_equal_cost():
 
 def test_copies_that_resonate_part():
     # The difference is rotated by pi, which at best exchanges the copies.
-    angles = [np.pi / 2, np.pi]
-    distances = []
-    for angle in angles:
-        solver = dps.PresymplecticCoupled(angle=angle)
-        saveat = dfx.SaveAt(t1=True, solver_state=True)
-        sol: Any = solve(MIXED, solver, 0.0, 50.0, 1 / 20, START, saveat=saveat)
-        distances.append(float(solver.distance(sol.ys, sol.solver_state)))
-    assert 0 < 5 * distances[0] < distances[1]
+    with pytest.raises(Exception, match="diverged"):
+        solver = dps.PresymplecticCoupled(angle=np.pi)
+        sol: Any = solve(MIXED, solver, 0.0, 50.0, 1 / 20, START)
+        jax.block_until_ready(sol.ys)
+    solver = dps.PresymplecticCoupled(angle=np.pi / 2)
+    solve(MIXED, solver, 0.0, 50.0, 1 / 20, START)
 
 
 STRETCH = 40.0

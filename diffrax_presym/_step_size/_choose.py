@@ -92,7 +92,7 @@ def choose_step(
 
     !!! example
 
-        ```python
+        ```text
         ts = jnp.linspace(0, 100, 201)
         problem, adjoint = (term, TunedRKN6(), 0.0, 100.0), FixedStepAdjoint()
         step = choose_step(*problem, y0, rtol=1e-6, atol=1e-6, ts=ts, adjoint=adjoint)

@@ -182,7 +182,7 @@ def work_precision(
 
     !!! example
 
-        ```python
+        ```text
         result = diagnostics.work_precision(
             term, 0.0, 100.0, y0, rtol=1e-6, ts=jnp.linspace(0, 100, 201)
         )
