@@ -58,8 +58,6 @@ def test_copies_that_resonate_part():
         solver = dps.PresymplecticCoupled(angle=np.pi)
         sol: Any = solve(MIXED, solver, 0.0, 50.0, 1 / 20, START)
         jax.block_until_ready(sol.ys)
-    solver = dps.PresymplecticCoupled(angle=np.pi / 2)
-    solve(MIXED, solver, 0.0, 50.0, 1 / 20, START)
 
 
 STRETCH = 40.0
