@@ -34,7 +34,8 @@ class Steps:
 
     total: Array
 
-    def __init__(self, controller, t0: Array, t1: Array, dt0: Array):
+    def __init__(self, stepsize_controller, t0: Array, t1: Array, dt0: Array, **rest):
+        controller = stepsize_controller
         self.t0, self.t1, self.dt0 = t0, t1, dt0
         self.ts = controller.ts if isinstance(controller, dfx.StepTo) else None
         if self.ts is not None:
@@ -133,6 +134,12 @@ class Output:
         return n % self.every != 0 if self.every else jnp.asarray(True)
 
 
+def flatten_subs(saveat: dfx.SaveAt):
+    """All of `SaveAt(subs=...)`, and the structure that they are in."""
+    is_sub = lambda x: isinstance(x, dfx.SubSaveAt)
+    return jtu.tree_flatten(saveat.subs, is_leaf=is_sub)
+
+
 class Inputs(NamedTuple):
     """The inputs of a solve."""
 
@@ -148,18 +155,15 @@ class Plan:
         rest, self.start = inputs.rest, inputs.start
         self.rest, self.solver = rest, rest["solver"]
         self.system, fns = inputs.parameters
-        names = "stepsize_controller", "t0", "t1", "dt0"
-        self.steps = Steps(*(rest[name] for name in names))
+        self.steps = Steps(**rest)
         self.last = self.steps.total
         if rest["max_steps"] is not None:
             self.last = jnp.minimum(self.last, rest["max_steps"])
-        is_sub = lambda x: isinstance(x, dfx.SubSaveAt)
-        subs, self.structure = jtu.tree_flatten(rest["saveat"].subs, is_leaf=is_sub)
+        subs, self.structure = flatten_subs(rest["saveat"])
         self.outputs = [
             Output(sub, fn, self.steps, self.last)
             for sub, fn in zip(subs, fns, strict=True)
         ]
-        self.at_once = False
         self.at_once = self._evaluates_at_once()
 
     @property
@@ -185,11 +189,8 @@ class Plan:
         # would not allow.
         end = jnp.where(end > begin, end, begin + 1)
         at_start = t <= begin
-        times = begin, end, jnp.where(at_start, end, t)
-        t0, t1, t = (system.time(x) for x in times)
-        shorter = lambda: self.solver.between(system, t0, t1, start, t)
-        if self.at_once:
-            return jtu.tree_map(partial(jnp.where, at_start), start[0], shorter())
+        t0, t = system.time(begin), system.time(jnp.where(at_start, end, t))
+        shorter = lambda: self.solver.between(system, t0, start, t)
         return lax.cond(at_start, lambda: start[0], shorter)
 
     def output(self, i: int, parameters, n: Array, start: PyTree, t: Array) -> PyTree:
@@ -295,12 +296,12 @@ def run(inputs: Inputs, keep: Callable[[Plan], Array] | None = None):
     `keep` gives the steps whose starting states are kept.
     """
     plan, init = Plan(inputs), inputs.rest["init_state"]
-    args, fns = plan.system.args, inputs.parameters[1]
+    args = plan.system.args
     saves = plan.structure.flatten_up_to(init.save_state)
     of_state = lambda i, now: now.state
     stacks, rows = [], []
     for i, (output, save) in enumerate(zip(plan.outputs, saves, strict=True)):
-        first = partial(fns[i], plan.steps.t0, plan.start[0], args)
+        first = partial(output.fn, plan.steps.t0, plan.start[0], args)
         rows.append(_set(save.ys, 0, first(), True) if output.first else save.ys)
         stack = None
         if len(output.held) and plan.at_once:
@@ -327,7 +328,7 @@ def run(inputs: Inputs, keep: Callable[[Plan], Array] | None = None):
             values = plan.all_outputs(i, inputs.parameters, starts[i])
         elif stacked[i] is not None:
             values, _ = stacked[i]
-        final = partial(fns[i], plan.steps.time(now.n), now.state[0], args)
+        final = partial(output.fn, plan.steps.time(now.n), now.state[0], args)
         states.append(_assemble(plan, output, save, now, ys, values, final))
     return _final_state(plan, now, plan.structure.unflatten(states)), trace
 

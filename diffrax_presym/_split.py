@@ -70,7 +70,20 @@ class AbstractSplit(eqx.Module):
         return first, system.add(second, h, force)
 
 
-class KineticSplit(AbstractSplit):
+class _AbstractKineticSplit(AbstractSplit):
+    """The drift is the flow of the kinetic part."""
+
+    def to_split(self, system: "System", t: Time, y: State) -> State:
+        return y
+
+    def from_split(self, system: "System", t: Time, z: State) -> State:
+        return z
+
+    def drift(self, system: "System", t: Time, h: Time, z: State, order: int) -> State:
+        return system.drift(t, h, z, order)
+
+
+class KineticSplit(_AbstractKineticSplit):
     """The drift is the flow of the kinetic part, and the kick that of the potential."""
 
     kinds: frozenset[str] = eqx.field(static=True)
@@ -84,35 +97,17 @@ class KineticSplit(AbstractSplit):
         names = {"any": True, "separable": separable, "nystrom": nystrom}
         self.kinds = frozenset(name for name, holds in names.items() if holds)
 
-    def to_split(self, system: "System", t: Time, y: State) -> State:
-        return y
-
-    def from_split(self, system: "System", t: Time, z: State) -> State:
-        return z
-
-    def drift(self, system: "System", t: Time, h: Time, z: State, order: int) -> State:
-        return system.drift(t, h, z, order)
-
     def force(self, system: "System", t: Time, z: State) -> PyTree:
         return system.potential_force(t, z)
 
 
-class LocalSplit(AbstractSplit):
+class LocalSplit(_AbstractKineticSplit):
     """The drift is the flow of the kinetic part, and the kick that of the potential and
     of friction that depends on place, for [`diffrax_presym.MechanicalSystem`][]."""
 
     @property
     def kinds(self) -> frozenset[str]:
         return frozenset({"any"})
-
-    def to_split(self, system: "System", t: Time, y: State) -> State:
-        return y
-
-    def from_split(self, system: "System", t: Time, z: State) -> State:
-        return z
-
-    def drift(self, system: "System", t: Time, h: Time, z: State, order: int) -> State:
-        return system.drift(t, h, z, order)
 
     def force(self, system: "System", t: Time, z: State) -> PyTree:
         q, _ = system.values(z)

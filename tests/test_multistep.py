@@ -245,7 +245,7 @@ def test_a_change_of_the_step_starts_again():
     end = dfx.diffeqsolve(*args, stepsize_controller=controller).ys
     exact = ends(hamiltonian, EXACT, 0.0, 5.0, 0.05, Y0, ONE)
     assert_close(end, exact, 1e-9)
-    # With a history that is not made anew, the error would be of the order of one.
+    # With a history that is not recomputed, the error would be of the order of one.
     uneven = ends(hamiltonian, solver, 0.0, 5.0, 0.107, Y0, ONE)
     assert_close(uneven, exact, 1e-9)
 

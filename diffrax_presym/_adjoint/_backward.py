@@ -43,7 +43,6 @@ class Backward:
         # The differentiated leaves of the system, and of all parameters.
         self.wanted, _ = perturbed.parameters
         self.moved, self.fixed = eqx.partition(inputs.parameters, perturbed.parameters)
-        self.finite = [jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(trace.end[0])]
         self.dense = _materialise(final.dense_infos, bars.dense_infos)
         self.carried = _materialise(final.solver_state, bars.solver_state)
         split = self.plan.structure.flatten_up_to

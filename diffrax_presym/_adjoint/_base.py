@@ -4,11 +4,10 @@ import diffrax as dfx
 import equinox as eqx
 import equinox.internal as eqxi
 import jax.lax as lax
-import jax.tree_util as jtu
 from jaxtyping import Array
 
 from .._closures import closure_to_pytree
-from .._loop import Inputs, Plan, Steps
+from .._loop import flatten_subs, Inputs, Plan, Steps
 from .._solver._base import AbstractPresymplecticSolver, Tabulated
 from .._term import as_system
 from ._backward import Backward, Position
@@ -53,9 +52,7 @@ class AbstractFixedStepAdjoint(dfx.AbstractAdjoint):
         first = carry.table if isinstance(carry, Tabulated) else None
         if isinstance(carry, Tabulated):
             # Most steps are of one length, but not all.
-            steps = Steps(
-                *(rest[x] for x in ("stepsize_controller", "t0", "t1", "dt0"))
-            )
+            steps = Steps(**rest)
             n = steps.total // 2
             t0, t1 = (system.time(steps.time(n + i)) for i in (0, 1))
             h = solver.step_length(t0, t1)
@@ -105,7 +102,4 @@ class AbstractFixedStepAdjoint(dfx.AbstractAdjoint):
 
 
 _is_none = lambda x: x is None
-_is_sub = lambda x: isinstance(x, dfx.SubSaveAt)
-_get_fns = lambda saveat: [
-    sub.fn for sub in jtu.tree_leaves(saveat.subs, is_leaf=_is_sub)
-]
+_get_fns = lambda saveat: [sub.fn for sub in flatten_subs(saveat)[0]]

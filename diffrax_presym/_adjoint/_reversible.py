@@ -14,7 +14,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
 from .._loop import Plan
-from .._misc import as_positive, largest, tree_sub
+from .._misc import all_finite, as_positive, largest, tree_sub
 from ._backward import Backward, Position
 from ._base import AbstractFixedStepAdjoint
 from ._rule import refuse
@@ -127,12 +127,9 @@ class ReversibleAdjoint(AbstractFixedStepAdjoint):
             at = backward.back_to(at, jnp.asarray(0), lambda n: None)
         at = backward.start(at)
         # A solve that diverged has a gradient of NaN anyway.
-        missed = ~(miss <= self.limit(at.state[0])[0])
-        finite = [jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(trace.end[0])]
-        missed = missed & jnp.all(jnp.stack(finite))
-        bars = at.bar, at.gradient
+        missed = ~(miss <= self.limit(at.state[0])[0]) & all_finite(trace.end[0])
         bar, gradient = eqx.error_if(
-            bars,
+            (at.bar, at.gradient),
             missed,
             "`ReversibleAdjoint` recomputed the states of this solve with an error "
             "beyond its `tol`: damping or instability amplifies rounding backwards in "

@@ -181,14 +181,9 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         return y, carry, first_failure(result, system.check(t1, y))
 
     def between(
-        self,
-        system: System,
-        t0: Array,
-        t1: Array,
-        start: tuple[State, _Carry],
-        t: Array,
+        self, system: System, t0: Array, start: tuple[State, _Carry], t: Array
     ) -> State:
-        """The state at `t` within the step from `t0` to `t1`, in full order.
+        """The state at `t` within a step from `t0`, in full order.
 
         By default a shorter step of the scheme from the start of the step.
         """
@@ -244,7 +239,7 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
 
         def at(fraction):
             t = t0 + fraction * h
-            y = self.between(system, t0, t1, start, t)
+            y = self.between(system, t0, start, t)
             return y, tree_scale(h, system.slope(t, y))
 
         return info | dict(inner=lax.map(at, cast_to(inner_points(number), h)))

@@ -210,12 +210,7 @@ class SymmetricMultistep(AbstractMoveSolver[_Carry]):
         return Move(forward, backward)
 
     def between(
-        self,
-        system: System,
-        t0: Array,
-        t1: Array,
-        start: tuple[State, _Carry],
-        t: Array,
+        self, system: System, t0: Array, start: tuple[State, _Carry], t: Array
     ) -> State:
         # A shorter step is always one of the one-step scheme.
         h = self.step_length(t0, t)

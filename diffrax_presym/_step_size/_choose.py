@@ -87,8 +87,8 @@ def choose_step(
     that of the grid, the error may be much smaller than aimed at.
 
     It needs concrete numbers, so it is called outside of `jax.jit`. It knows only what
-    it is given: choose a step anew for another initial state or other parameters, or
-    for the most difficult one of a batch.
+    it is given: choose another step for another initial state or other parameters, and
+    in a batch that of its most difficult member.
 
     !!! example
 
