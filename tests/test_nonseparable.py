@@ -54,10 +54,26 @@ def test_free_copies_are_more_accurate_at_equal_cost():
 
 def test_copies_that_resonate_part():
     # The difference is rotated by pi, which at best exchanges the copies.
-    with pytest.raises(Exception, match="diverged"):
-        solver = dps.PresymplecticCoupled(angle=np.pi)
-        sol: Any = solve(MIXED, solver, 0.0, 50.0, 1 / 20, START)
-        jax.block_until_ready(sol.ys)
+    angles = [np.pi / 2, np.pi]
+    distances, results = [], []
+    for angle in angles:
+        solver = dps.PresymplecticCoupled(angle=angle)
+        saveat = dfx.SaveAt(t1=True, solver_state=True)
+        options: Any = dict(saveat=saveat, throw=False)
+        sol: Any = solve(MIXED, solver, 0.0, 50.0, 1 / 20, START, **options)
+        distances.append(float(solver.distance(sol.ys, sol.solver_state)))
+        results.append(sol.result)
+    assert 0 < 5 * distances[0] < distances[1]
+    assert results[0] == dfx.RESULTS.successful
+    assert results[1] == dfx.RESULTS.nonlinear_divergence
+
+
+@pytest.mark.parametrize("order", [2, 4])
+def test_copies_that_pass_zero_have_not_parted(order):
+    # From rest, to which the momentum returns with an error larger than itself.
+    for solver in (dps.PresymplecticCoupled(order), dps.PresymplecticProjected(order)):
+        sol = solve(MIXED, solver, 0.0, 50.0, 1 / 20, START)
+        assert sol.result == dfx.RESULTS.successful
 
 
 STRETCH = 40.0

@@ -79,33 +79,34 @@ def separate(rotated: Callable[[Array, State], State]) -> Move:
         return (y, (copy, paired_field(system, span.t0, y, copy))), None
 
     def join(system: System, span: Span, stage: Stage) -> Outcome:
-        y, (copy, _) = stage
+        y, (copy, field) = stage
         half = tree_scale(0.5, system.subtract(y, copy))
-        return (system.add(y, -1, half), rotated(span.h, half)), None
+        y = system.add(y, -1, half)
+        result = _distance_check(system, span.h, y, half, field)
+        return (y, rotated(span.h, half)), result
 
     return Move(apart, join)
 
 
-def _check_distance(system: System, span: Span, stage: Stage) -> Outcome:
-    # Once the copies are as far from each other as they are large, they are separate
-    # trajectories, and their mean is none. Rounding may be larger than what is at rest.
-    y, half = stage
-    sizes = [largest(x) for x in system.values(y)]
-    distances = [2 * largest(x) for x in half]
+def _distance_check(system: System, h: Array, y: State, half: State, field: State):
+    """A failure once the copies have parted.
+
+    They are separate trajectories, and their mean is none, if they are further from
+    each other than they are large, or move in a step: what oscillates passes zero.
+    """
+    state, rates = system.values(y), system.values(field)
     with jax.numpy_dtype_promotion("standard"):
+        sizes = [
+            jnp.maximum(largest(x), jnp.abs(h) * largest(rate))
+            for x, rate in zip(state, rates, strict=True)
+        ]
+        # Rounding may be larger than what is at rest.
         eps = max(float(jnp.finfo(x.dtype).eps) for x in sizes)
         rounding = eps ** (1 / 3) * jnp.maximum(*sizes)
-        pairs = zip(sizes, distances, strict=True)
-        q, p = (d > jnp.maximum(size, rounding) for size, d in pairs)
+        pairs = zip(half, sizes, strict=True)
+        q, p = (2 * largest(x) > jnp.maximum(size, rounding) for x, size in pairs)
     failure: Any = dfx.RESULTS.nonlinear_divergence
-    return stage, dfx.RESULTS.where(q | p, failure, dfx.RESULTS.successful)
-
-
-def _keep(system: System, span: Span, stage: Stage) -> Outcome:
-    return stage, None
-
-
-check_distance = Move(_check_distance, _keep)
+    return dfx.RESULTS.where(q | p, failure, dfx.RESULTS.successful)
 
 
 def rotate(angle: Array, y: State, scale: ArrayLike = 1.0) -> State:

@@ -10,7 +10,7 @@ from .._split import State
 from .._system import System
 from ._base import AbstractMoveSolver, AbstractPresymplecticSolver
 from ._composition import rows
-from ._copies import check_distance, exchange, move_frames, rotate, separate
+from ._copies import exchange, move_frames, rotate, separate
 from ._engine import forward, Moves, Result, Span, Stages
 from ._tableaus import (
     SOFRONIOU_SPALETTA_6,
@@ -45,8 +45,8 @@ def _free_step(order: int, rotated: Callable[[Array, State], State]) -> Stages:
     table = [(0, 0, 0.5), (0, 0.5, 0.5), (0.5, 0.5, 1), (0.5, 1, 0.5), (1, 1, 0.5)]
     stages = Stages([Stages(moves, table)], rows(_WEIGHTS[order]))
     apart = separate(rotated)
-    moves = apart, stages, apart.inverse, check_distance
-    return Stages(moves, [(0, 0, 1), (0, 1, 1), (1, 1, 1), (1, 1, 1)])
+    moves = apart, stages, apart.inverse
+    return Stages(moves, [(0, 0, 1), (0, 1, 1), (1, 1, 1)])
 
 
 def _check_order(order, name: str) -> int:
@@ -72,9 +72,10 @@ class PresymplecticCoupled(AbstractMoveSolver[State]):
     fixed angle, so that it does not accumulate. The solution is their mean, which
     depends on the difference only in second order. There is no strength to choose, and
     no order is lost. The `solver_state` holds half of the difference. A solve fails,
-    with `RESULTS.nonlinear_divergence`, if the copies differ by more than their size:
-    the coupling is not stable with strong friction that is part of the force. Then use
-    shorter steps or [`diffrax_presym.PresymplecticGauss`][].
+    with `RESULTS.nonlinear_divergence`, if the copies differ by more than their size,
+    or than they move in a step: the coupling is not stable with strong friction that is
+    part of the force. Then use shorter steps or
+    [`diffrax_presym.PresymplecticGauss`][].
     """
 
     composed_order: int = eqx.field(static=True)
