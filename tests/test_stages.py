@@ -9,10 +9,18 @@ import pytest
 from helpers import solve
 
 import diffrax_presym as dps
+from diffrax_presym import _scan
 from diffrax_presym._scan import equations, scan_stages
 
 
 TIMES, LENGTHS = jnp.array([0.1, 0.2, 0.4]), jnp.array([1.0, -2.0, 3.0])
+
+
+HAMILTONIAN = dps.ConformalHamiltonian(
+    dps.QuadraticKinetic(),
+    lambda t, q, args: -jnp.sum(jnp.cos(q)),
+    dps.ConstantDamping(0.1),
+)
 
 
 def by(scan, rate, y, reverse=False):
@@ -26,14 +34,37 @@ def by(scan, rate, y, reverse=False):
     return scan(stage, y, (TIMES, LENGTHS), reverse=reverse)
 
 
+@pytest.mark.parametrize("cpu", [True, False], ids=["cpu", "gpu"])
 @pytest.mark.parametrize("reverse", [False, True])
 @pytest.mark.parametrize("n", [2, 40])
-def test_as_a_scan(n, reverse):
+def test_as_a_scan(n, reverse, cpu, monkeypatch):
+    monkeypatch.setattr(_scan, "_is_cpu", lambda: cpu)
     y, rate = jnp.linspace(-1.0, 1.0, n), jnp.array(0.3)
     both = [by(scan, rate, y, reverse) for scan in (scan_stages, lax.scan)]
     assert jax.tree.structure(both[0]) == jax.tree.structure(both[1])
     for x, y in zip(*map(jax.tree.leaves, both), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-14)
+
+
+def test_stages_are_written_out_except_on_a_cpu(monkeypatch):
+    scheme = dps.BlanesMoanRKN4()
+
+    def run(y):
+        sol = solve(HAMILTONIAN, scheme, 0.0, 1.0, 0.1, (y, y))
+        return sol.ys
+
+    y, loops = jnp.array([0.3]), []
+    for cpu in (True, False):
+        monkeypatch.setattr(_scan, "_is_cpu", lambda cpu=cpu: cpu)
+        jax.clear_caches()
+        found = equations(jax.make_jaxpr(run)(y).eqns)
+        scans = [e.params for e in found if e.primitive.name == "scan"]
+        stages = [x for x in scans if x["length"] == len(scheme.tableau.fractions) // 2]
+        loops.append((run(y), {x["unroll"] == x["length"] for x in stages}))
+    (by_loop, rolled), (written_out, unrolled) = loops
+    assert rolled == {False} and unrolled == {True}
+    for a, b in zip(by_loop, written_out, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-14)
 
 
 @pytest.mark.parametrize(
