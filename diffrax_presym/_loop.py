@@ -343,7 +343,8 @@ def _walk(plan: Plan, records: PyTree) -> tuple[Now, PyTree]:
         if equal:
             # What depends on the length alone is computed before the loop.
             span = span._replace(h=plan.length)
-        y, carry, result = solver.attempt(system, *span, *now.state)
+        fitted = solver.fitted(system, span.t1, span.h, now.state[0])
+        y, carry, result = solver.attempt(fitted, *span, *now.state)
         end, infos = (y, carry), now.dense
         if infos is not None:
             info = solver.dense_info(system, *span, now.state, end)

@@ -176,7 +176,6 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         self, system: System, t0: Array, t1: Array, h: Array, y: State, carry: _Carry
     ) -> tuple[State, _Carry, Result]:
         """One step, with a failure if its end is invalid."""
-        system = self.fitted(system, t1, h, y)
         y, carry, result = self.advance(system, t0, t1, h, y, carry)
         return y, carry, first_failure(result, system.check(t1, y))
 
