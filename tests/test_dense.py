@@ -62,7 +62,8 @@ def test_order_between_the_steps(name, half):
     solver, order = SOLVERS[name]
     which = "qp".index(half)
     errors = []
-    for h in (0.15, 0.075):
+    # At order 8 with steps above rounding.
+    for h in (0.3, 0.15) if order == 8 else (0.15, 0.075):
         ys = solve(SYSTEM, solver, 0.0, T1, h, Y0, saveat=dfx.SaveAt(ts=TS)).ys
         error = jax.tree.map(lambda y, e: np.max(np.abs(y - e)), ys, exact())
         errors.append(error[which])

@@ -86,3 +86,12 @@ def test_processes_end_at_the_limit(tmp_path):
     code, output, _ = run(tmp_path, *options, limit=100)
     assert code == 1
     assert "Figure" not in output
+
+
+def test_an_import_leaves_devices_to_be_chosen():
+    code = (
+        "import diffrax_presym, jax; jax.config.update('jax_num_cpu_devices', 2); "
+        "assert jax.device_count() == 2"
+    )
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": ""}
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True)

@@ -52,7 +52,8 @@ class ViscousDamping(eqx.Module):
     With numbers or arrays the cost is that of
     [`diffrax_presym.ConstantDamping`][]. With matrices, exponentials for all stages of
     a step are computed once at the start of a solve, and again in steps of another
-    length; a drift is two products with a matrix. Above some hundreds of degrees of
+    length; a drift is two products with a matrix. Beside [`diffrax_presym.Drag`][] they
+    are computed in every stage. Above some hundreds of degrees of
     freedom, if the matrix is sparse, pass a `lineax.FunctionLinearOperator`: each drift
     then takes about 20 products with $C$, and no matrix is stored.
 
@@ -243,6 +244,8 @@ class ViscousFriction(AbstractFriction):
     mass: Form
     law: AbstractDamping | None = None
     table: _Table | None = None
+    # Whether it acts over whole stages, whose lengths are known beforehand.
+    over_stages: bool = eqx.field(static=True, default=True)
 
     # What it is for a state.
 
@@ -411,7 +414,7 @@ class ViscousFriction(AbstractFriction):
     # The table.
 
     def has_table(self, p: PyTree) -> bool:
-        if self.law is not None or self.table is not None:
+        if self.law is not None or self.table is not None or not self.over_stages:
             return False
         leaves, rates, _ = self._leaves(p)
         pairs = zip(leaves, rates, strict=True)
@@ -430,8 +433,13 @@ class ViscousFriction(AbstractFriction):
         return _Table(times, radius, list(map(entry, leaves, rates)))
 
     def with_table(self, table: _Table) -> "ViscousFriction":
+        is_none = lambda x: x is None
+        return eqx.tree_at(lambda x: x.table, self, table, is_leaf=is_none)
+
+    def over_parts(self) -> "ViscousFriction":
+        """The same friction, which acts over parts of stages."""
         return ViscousFriction(
-            self.rates, self.coefficients, self.mass, self.law, table
+            self.rates, self.coefficients, self.mass, self.law, over_stages=False
         )
 
 

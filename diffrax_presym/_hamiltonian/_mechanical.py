@@ -181,6 +181,9 @@ class MechanicalSystem(AbstractHamiltonian):
         """The linear friction that does not depend on place, part of every drift."""
         stiffness = getattr(self._potential, "stiffness", None)
         friction = as_friction(self._linear, self._mass, stiffness)
+        if self._drags and isinstance(friction, ViscousFriction):
+            # The drift is then composed of the two.
+            return friction.over_parts()
         if friction is None or self.table is None:
             return friction
         return friction.with_table(self.table)

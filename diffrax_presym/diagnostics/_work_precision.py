@@ -34,25 +34,26 @@ from ._count import counted, Counter
 
 
 # The explicit schemes for energies that separate or split, those for any energy where
-# none of them accepts the system, and the solvers of Diffrax.
+# none of them accepts the system, and the solvers of Diffrax. They are made when they
+# are needed: an import must not choose the devices of JAX.
 SEPARABLE = {
-    "PresymplecticLeapfrog": PresymplecticLeapfrog(),
-    "BlanesMoanRKN4": BlanesMoanRKN4(),
-    "BlanesMoan4": BlanesMoan4(),
-    "TunedRKN6": TunedRKN6(),
-    "BlanesMoan6": BlanesMoan6(),
-    "BlanesCasasRKN8": BlanesCasasRKN8(),
-    "SofroniouSpaletta8": SofroniouSpaletta8(),
-    "TunedLinear8": TunedLinear8(),
+    "PresymplecticLeapfrog": PresymplecticLeapfrog,
+    "BlanesMoanRKN4": BlanesMoanRKN4,
+    "BlanesMoan4": BlanesMoan4,
+    "TunedRKN6": TunedRKN6,
+    "BlanesMoan6": BlanesMoan6,
+    "BlanesCasasRKN8": BlanesCasasRKN8,
+    "SofroniouSpaletta8": SofroniouSpaletta8,
+    "TunedLinear8": TunedLinear8,
 }
 NONSEPARABLE = {
-    "PresymplecticCoupled(2)": PresymplecticCoupled(2),
-    "PresymplecticCoupled(4)": PresymplecticCoupled(4),
-    "PresymplecticCoupled(6)": PresymplecticCoupled(6),
-    "PresymplecticGauss(4)": PresymplecticGauss(4),
-    "PresymplecticGauss(6)": PresymplecticGauss(6),
+    "PresymplecticCoupled(2)": functools.partial(PresymplecticCoupled, 2),
+    "PresymplecticCoupled(4)": functools.partial(PresymplecticCoupled, 4),
+    "PresymplecticCoupled(6)": functools.partial(PresymplecticCoupled, 6),
+    "PresymplecticGauss(4)": functools.partial(PresymplecticGauss, 4),
+    "PresymplecticGauss(6)": functools.partial(PresymplecticGauss, 6),
 }
-DIFFRAX = {"Tsit5": dfx.Tsit5(), "Dopri8": dfx.Dopri8()}
+DIFFRAX = {"Tsit5": dfx.Tsit5, "Dopri8": dfx.Dopri8}
 
 # Evaluations of more constant steps than these are extrapolated.
 COUNTED_STEPS = 1000
@@ -407,10 +408,9 @@ def _methods(problem: Problem, solvers, left_out: dict[str, str]) -> list[Method
         return good
 
     if solvers is None:
-        ours = accepted(SEPARABLE)
-        if not ours:
-            ours = accepted(NONSEPARABLE)
-        solvers = ours | DIFFRAX
+        made = lambda makers: {name: make() for name, make in makers.items()}
+        ours = accepted(made(SEPARABLE)) or accepted(made(NONSEPARABLE))
+        solvers = ours | made(DIFFRAX)
     else:
         solvers = accepted(solvers)
     methods = []
