@@ -14,7 +14,9 @@ the package was tuned on the test half. `--saved` saves at 201 times, where the 
 the largest over these, relative to the largest entry of the solution.
 """
 
+import concurrent.futures
 import math
+import multiprocessing
 import pathlib
 import platform
 import statistics
@@ -202,6 +204,23 @@ def picture(results, path):
     error_against_time(named, groups, path, columns=2)
 
 
+def measure(make, which, saved, repeats, quick):
+    """The name of a problem, a curve for each method, and the time it took."""
+    problem, start = make(), time.perf_counter()
+    ts = np.linspace(0, problem.t1, SAVED) if saved else None
+    if ts is None:
+        exact = problem.reference()
+    else:
+        first = jax.tree.map(lambda x: x[None], problem.y0)
+        later = problem.solution(ts)
+        exact = jax.tree.map(lambda a, b: np.concatenate([a, b]), first, later)
+    runs = all_runs(problem, quick, ts)
+    error = lambda y: relative_error(y, exact)
+    enough = None if which == "seven" else (min(TARGETS), 1.0)
+    curves = error_curves(runs, error, repeats, enough)
+    return problem.name, curves, time.perf_counter() - start
+
+
 def main():
     parser = command_line(__doc__)
     parser.add_argument("--repeats", type=int, default=7)
@@ -214,22 +233,14 @@ def main():
     makers = makers[::3] if options.quick else makers
     results = {}
     print(f"{platform.processor() or platform.machine()}, median of {repeats} runs")
+    # A process for each problem: compiled programs are kept until it ends.
+    spawn = multiprocessing.get_context("spawn")
     for make in makers:
-        problem, start = make(), time.perf_counter()
-        ts = np.linspace(0, problem.t1, SAVED) if options.saved else None
-        if ts is None:
-            exact = problem.reference()
-        else:
-            first = jax.tree.map(lambda x: x[None], problem.y0)
-            later = problem.solution(ts)
-            exact = jax.tree.map(lambda a, b: np.concatenate([a, b]), first, later)
-        runs = all_runs(problem, options.quick, ts)
-        error = lambda y, exact=exact: relative_error(y, exact)
-        enough = None if options.set == "seven" else (min(TARGETS), 1.0)
-        results[problem.name] = error_curves(runs, error, repeats, enough)
-        taken = time.perf_counter() - start
-        print(f"{problem.name}: measured in {taken:.0f} s", flush=True)
-        jax.clear_caches()
+        with concurrent.futures.ProcessPoolExecutor(1, mp_context=spawn) as pool:
+            task = measure, make, options.set, options.saved, repeats, options.quick
+            name, curves, taken = pool.submit(*task).result()
+        results[name] = curves
+        print(f"{name}: measured in {taken:.0f} s", flush=True)
     tables(results)
     if options.set == "seven" and not options.saved:
         picture(results, options.output / "work_precision.png")
