@@ -59,6 +59,8 @@ def states(system, solver, times, y0, x, args=None, *, adaptive=False, **options
     t0, t1 = times
     if adaptive:
         options["controller"] = dfx.PIDController(rtol=x, atol=x)
+        # A motion that escapes would never end.
+        options["max_steps"] = 10**5
     dt0 = None if adaptive else (t1 - t0) / x
     sol = solve(system, solver, t0, t1, dt0, y0, args, **options)
     good = sol.result == dfx.RESULTS.successful
