@@ -1,6 +1,6 @@
 """Presymplectic integrators for Diffrax."""
 
-from . import diagnostics as diagnostics
+from . import diagnostics as diagnostics, math as math
 from ._adjoint import (
     FixedStepAdjoint as FixedStepAdjoint,
     ReversibleAdjoint as ReversibleAdjoint,

@@ -33,6 +33,7 @@ PUBLIC |= {
     for name, value in vars(dps.diagnostics).items()
     if not name.startswith("_") and ".diagnostics." in getattr(value, "__module__", "")
 }
+PUBLIC |= {"math.sin": dps.math.sin, "math.cos": dps.math.cos}
 REFERENCE = re.compile(
     r"\[`?(diffrax_presym\.[\w.]+)`?\]\[|\]\[(diffrax_presym\.[\w.]+)\]"
 )
