@@ -90,24 +90,12 @@ def spread(n, *boxes):
     ]
 
 
-def polynomial_sine(x):
-    """The sine to 2e-16 for moderate arguments, in operations that XLA vectorises."""
-    halves = jnp.round(x / math.pi)
-    x = (x - halves * math.pi) - halves * 1.2246467991473532e-16
-    square, series = x * x, 0.0
-    for k in range(10, 0, -1):
-        series = (series + (-1) ** k / math.factorial(2 * k + 1)) * square
-    x = x + x * series
-    return jnp.where(halves - 2 * jnp.floor(halves / 2) == 0, x, -x)
-
-
 def pendulums():
     problem = problems.pendulum()
     polynomial = dps.ConformalHamiltonian(
         dps.QuadraticKinetic(),
-        lambda t, q, args: -jnp.sum(jnp.cos(q)),
+        lambda t, q, args: -jnp.sum(dps.math.cos(q)),
         problem.hamiltonian.damping,
-        force=lambda t, q, args: -polynomial_sine(q),
     )
     return Batch(
         problem,

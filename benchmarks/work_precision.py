@@ -77,7 +77,7 @@ def solver_of(problem, terms, solver, adaptive=False, ts=None):
     options = {}
     if ts is not None:
         options["saveat"] = dfx.SaveAt(ts=jnp.asarray(ts))
-    if ts is not None and ours:
+    if ours:
         reversible = solver.reverse is not None
         fast = dps.ReversibleAdjoint if reversible else dps.FixedStepAdjoint
         options["adjoint"] = fast()
