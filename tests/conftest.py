@@ -24,6 +24,7 @@ def _memory():
     yield
     jax.clear_caches()
 
+
 # The slowest of several similar tests, by `pytest --durations`. They are marked slow,
 # as are those with the marker in their own file.
 SLOW = re.compile(

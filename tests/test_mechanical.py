@@ -1,6 +1,7 @@
 """Friction of every kind: by degree of freedom, matrix, place and speed."""
 
 import functools
+import math
 from typing import Any
 
 import diffrax as dfx
@@ -13,6 +14,7 @@ import optimistix as optx
 import pytest
 import scipy.integrate
 import scipy.linalg
+import scipy.optimize
 from helpers import assert_close, flat, harmonic, solve, step
 
 import diffrax_presym as dps
@@ -807,3 +809,33 @@ def test_drag_needs_bodies():
     wrong = dps.MechanicalSystem(unequal, harmonic, dps.Drag(0.1))
     with pytest.raises(ValueError, match="one for each body"):
         step(wrong, dps.BlanesMoan4(), 0.0, 0.1, Y0)
+
+
+@pytest.mark.parametrize("law", ["matrix", "drag"])
+def test_events(law):
+    """A body that falls to the ground, whose height is known in closed form."""
+    c = 0.4
+    friction = dps.ViscousDamping(c * jnp.eye(2)) if law == "matrix" else dps.Drag(c)
+    ball = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), lambda t, q, args: q[1], friction
+    )
+    solver = dps.TunedRKN6() if law == "matrix" else dps.BlanesMoan6()
+    if law == "matrix":
+        height = lambda t: 2.0 - t / c - math.expm1(-c * t) / c**2
+    else:
+        height = lambda t: 2.0 - math.log(math.cosh(t * c**0.5)) / c
+    landing = scipy.optimize.brentq(height, 0, 10, xtol=1e-15)
+
+    @jax.jit
+    def fly(start):
+        return dfx.diffeqsolve(
+            *(dps.HamiltonianTerm(ball), solver, 0.0, 10.0, 0.1),
+            (jnp.stack([jnp.zeros(()), start]), jnp.zeros(2)),
+            event=dfx.Event(
+                lambda t, y, args, **kwargs: y[0][1], optx.Newton(1e-13, 1e-13)
+            ),
+        )
+
+    sol = fly(jnp.asarray(2.0))
+    assert sol.result == dfx.RESULTS.event_occurred
+    assert abs(sol.ts[0] - landing) < 1e-9
