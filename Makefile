@@ -36,8 +36,9 @@ demo: $(VENV)/.with-examples  ## Run the quick start: print its tables and save 
 test: $(VENV)/.with-tests  ## Run the tests, except the slow ones
 	@$(BIN)/python $(PYTEST) -m "not slow"
 
+# `make slow PART=1/4` runs the first quarter of them.
 slow: $(VENV)/.with-tests  ## Run the slow tests
-	@$(BIN)/python $(PYTEST) -m slow
+	@$(BIN)/python $(PYTEST) -m slow $(if $(PART),--part $(PART))
 
 # By default the code of the documentation, which covers most features, and the loop over
 # stages, which relies on JAX internals. `make oldest TESTS=tests` runs all tests.
