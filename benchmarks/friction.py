@@ -8,7 +8,6 @@ MuJoCo, where it is installed.
 """
 
 import dataclasses
-import importlib
 import math
 from functools import partial
 from typing import Any
@@ -18,10 +17,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _mujoco import mujoco_tables
 from _report import command_line, Table
 from _schemes import DIFFRAX, SCHEMES
-from _solve import final_state, last, reference, relative_error, solve
-from _timing import error_curves, interleaved, time_to
+from _solve import final_state, reference, relative_error, solve
+from _timing import error_curves, time_to
 
 import diffrax_presym as dps
 
@@ -267,7 +267,9 @@ def main():
         values = (float(np.exp(np.mean(np.log(x)))) if x else None for x in known)
         table.row("geometric mean", kind, *values, "", "")
     if not options.only:
-        mujoco_tables(options.quick)
+        schemes = ("PresymplecticLeapfrog", "BlanesMoanRKN4", "TunedRKN6")
+        solvers = {name: SCHEMES[name].solver for name in schemes}
+        mujoco_tables(mujoco_problems(), solvers, options.quick)
 
 
 def _names(best):
@@ -286,7 +288,7 @@ _SHORT = {
 }
 
 
-# MuJoCo, in C: the same system, its error and its time per simulated second.
+# The same systems in MuJoCo.
 
 HINGE = """<mujoco><option gravity="0 0 -9.81"><flag contact="disable"/></option>
 <worldbody><body pos="0 0 2"><joint name="j0" type="hinge" axis="0 1 0" damping="0.1"/>
@@ -329,62 +331,6 @@ def mujoco_problems():
         "one hinge": (HINGE, hinge, (jnp.array([2.0]), jnp.zeros(1)), 20.0),
         "8 slide joints": (slides(n), chain, (q0, jnp.zeros(n)), 20.0),
     }
-
-
-@eqx.filter_jit
-def _end(system, t1, y0, solver, dt0):
-    return last(solve(system, solver, 0.0, t1, dt0, y0))
-
-
-def mujoco_tables(quick):
-    try:
-        mujoco: Any = importlib.import_module("mujoco")
-    except ImportError:
-        print("\nMuJoCo is not installed: pip install mujoco")
-        return
-    kinds = mujoco.mjtIntegrator
-    integrators = {
-        "Euler": kinds.mjINT_EULER,
-        "implicitfast": kinds.mjINT_IMPLICITFAST,
-        "RK4": kinds.mjINT_RK4,
-    }
-    for name, (xml, system, (q0, p0), t1) in mujoco_problems().items():
-        model = mujoco.MjModel.from_xml_string(xml)
-
-        def simulate(integrator, steps, model=model, q0=q0, t1=t1):
-            model.opt.integrator, model.opt.timestep = integrator, t1 / steps
-            data = mujoco.MjData(model)
-            data.qpos[:] = q0
-            mujoco.mj_step(model, data, nstep=steps)
-            return data.qpos.copy(), data.qvel.copy()
-
-        exact = simulate(kinds.mjINT_RK4, 40_000 if quick else 200_000)
-        size = max(np.max(np.abs(x)) for x in exact)
-
-        def error(found, exact=exact, size=size):
-            pairs = zip(found, exact, strict=True)
-            return max(np.max(np.abs(x - y)) for x, y in pairs) / size
-
-        table = Table(
-            f"MuJoCo, {name}, to t = {t1}",
-            *("integrator:<24", "steps:>7", "error:>9.1e", "milliseconds:>13.3f"),
-        )
-        calls, errors = {}, {}
-        for label, kind in integrators.items():
-            for steps in (1000, 4000, 16000):
-                calls[f"MuJoCo {label}", steps] = partial(simulate, kind, steps)
-        run = partial(_end, system, t1, (q0, p0))
-        for label in ("PresymplecticLeapfrog", "BlanesMoanRKN4", "TunedRKN6"):
-            for steps in (50, 200, 800):
-                calls[label, steps] = partial(run, SCHEMES[label].solver, t1 / steps)
-        timings = interleaved(calls, 3 if quick else 9)
-        for (label, steps), timing in timings.items():
-            found = timing.result
-            if not label.startswith("MuJoCo"):
-                found = found[0], system.velocity(0.0, *found)
-            errors[label, steps] = error([np.asarray(x) for x in found])
-            milliseconds = 1e3 * timing.median
-            table.row(label, str(steps), errors[label, steps], milliseconds)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,14 @@
-"""Gauss collocation for nonseparable energies: time of a solve against its error.
+"""Energies that do not separate: time of a solve against its error.
 
-Double pendulum and chain of three hinges with friction in each joint, and
-H = (q^2 + 1) (p^2 + 1) / 2; with `PresymplecticCoupled` and Diffrax's `Dopri8`. A dash
-is an error that none of the runs reached. The last two rows are ratios of best times.
+Linkages with friction in each joint, a charged particle, geodesics on an ellipsoid and
+around a black hole, a relativistic particle in a field, and Tao's benchmark, with
+`PresymplecticGauss`, `PresymplecticCoupled`, and Diffrax's `Tsit5`, `Dopri5`, `Dopri8`
+and `Kvaerno5`, adaptive and with constant steps. A dash is an error that no run
+reached. `--only chain` measures the problems whose names begin so.
+
+`--mujoco` compares chains of 3 and of 10 hinges, with a damper in each, with MuJoCo,
+and their mass matrices. `--long` follows the energy of an undamped double pendulum over
+a million steps, of several lengths.
 """
 
 from functools import partial
@@ -12,7 +18,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _mujoco import mujoco_mass, mujoco_tables
 from _report import command_line, Table
+from _schemes import DIFFRAX
 from _solve import final_state, reference, relative_error
 from _timing import error_curves, time_to
 
@@ -22,6 +30,7 @@ import diffrax_presym as dps
 jax.config.update("jax_enable_x64", True)
 
 TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
+TOLERANCES = 10.0 ** -np.arange(2, 14)
 GRAVITY = 9.81
 
 
@@ -37,84 +46,274 @@ def chain_potential(t, q, args):
     return -GRAVITY * jnp.sum((n - np.arange(n)) * jnp.cos(q))
 
 
-def mixed_energy(t, q, p, args):
-    return jnp.sum((q**2 + 1) * (p**2 + 1)) / 2
-
-
-def chain(n):
-    system = dps.LagrangianSystem(chain_mass, chain_potential, friction=0.1)
+def chain(n, friction=0.1):
+    system = dps.LagrangianSystem(chain_mass, chain_potential, friction)
     return system, (jnp.linspace(1.0, 1.5, n), jnp.zeros(n)), 10.0
 
 
+def charged_particle():
+    """In the plane, in a field that decays at the rate of the drag, and a trap."""
+
+    def energy(t, q, p, args):
+        a = 2 * jnp.exp(-0.05 * t) * jnp.stack([-q[1], q[0]])
+        return jnp.sum((p - a) ** 2) / 2 + q[0] ** 2 / 2 + q[1] ** 2
+
+    system = dps.ConformalHamiltonian(energy=energy, damping=dps.ConstantDamping(0.05))
+    return system, (jnp.array([1.0, 0.0]), jnp.array([0.0, 2.5])), 40.0
+
+
+def ellipsoid():
+    """Free motion on an ellipsoid of half axes 1, 1.3 and 0.7."""
+
+    def place(q):
+        a, b = q
+        return jnp.stack(
+            [
+                jnp.cos(a) * jnp.cos(b),
+                1.3 * jnp.cos(a) * jnp.sin(b),
+                0.7 * jnp.sin(a),
+            ]
+        )
+
+    def metric(t, q, args):
+        jacobian = jax.jacfwd(place)(q)
+        return jacobian.T @ jacobian
+
+    system = dps.LagrangianSystem(metric, lambda t, q, args: jnp.zeros(()))
+    q0 = jnp.array([0.3, 0.0])
+    return system, (q0, system.from_velocity(0.0, q0, jnp.array([0.7, 1.0]))), 60.0
+
+
+def relativistic():
+    """A charge at high speed, in a magnetic field that grows outwards, and a trap."""
+
+    def energy(t, q, p, args):
+        a = (1 + jnp.sum(q**2) / 4) * jnp.stack([-q[1], q[0]]) / 2
+        return jnp.sqrt(1 + jnp.sum((p - a) ** 2)) + jnp.sum(q**2) / 4
+
+    system = dps.Hamiltonian(energy)
+    return system, (jnp.array([1.0, 0.5]), jnp.array([0.0, 2.0])), 60.0
+
+
+def black_hole():
+    """A bound orbit in the Schwarzschild metric, in units of the mass."""
+
+    def energy(t, q, p, args):
+        r = jnp.sqrt(q @ q)
+        radial = q @ p / r
+        return jnp.sqrt((1 - 2 / r) * (1 + p @ p - 2 / r * radial**2))
+
+    system = dps.Hamiltonian(energy)
+    return system, (jnp.array([16.0, 0.0]), jnp.array([0.0, 0.27])), 3000.0
+
+
+def mixed(t1):
+    """Tao (2016)."""
+    energy = lambda t, q, p, args: jnp.sum((q**2 + 1) * (p**2 + 1)) / 2
+    return dps.Hamiltonian(energy), (jnp.array([-3.0]), jnp.array([0.0])), t1
+
+
+# The problem, and the longest step to begin with.
 PROBLEMS = {
-    "double pendulum": chain(2),
-    "chain of 3": chain(3),
-    "(q^2 + 1)(p^2 + 1)/2": (
-        dps.Hamiltonian(mixed_energy),
-        (jnp.array([-3.0]), jnp.array([0.0])),
-        20.0,
-    ),
+    "double pendulum": (partial(chain, 2), 0.5),
+    "chain of 3": (partial(chain, 3), 0.3),
+    "chain of 10": (partial(chain, 10), 0.1),
+    "charged particle": (charged_particle, 1.0),
+    "geodesic on an ellipsoid": (ellipsoid, 1.0),
+    "relativistic charge": (relativistic, 1.0),
+    "orbit around a black hole": (black_hole, 60.0),
+    "(q^2 + 1)(p^2 + 1)/2": (partial(mixed, 1e4), 0.3),
 }
 FIXED = {
-    **{f"Gauss({s})": (dps.PresymplecticGauss(s), 8 * s) for s in (2, 3, 4, 5, 6, 8)},
-    "Coupled(4)": (dps.PresymplecticCoupled(4), 11),
-    "Coupled(6)": (dps.PresymplecticCoupled(6), 27),
+    **{f"Gauss({s})": dps.PresymplecticGauss(s) for s in (3, 4, 6, 8)},
+    # The iteration ended at a hundredth of the error that is wanted.
+    "Gauss(2), 1e-5": dps.PresymplecticGauss(2, tolerance=1e-5),
+    "Gauss(4), 1e-5": dps.PresymplecticGauss(4, tolerance=1e-5),
+    "Gauss(4), 1e-8": dps.PresymplecticGauss(4, tolerance=1e-8),
+    "Gauss(6), 1e-8": dps.PresymplecticGauss(6, tolerance=1e-8),
+    "Gauss(6), 1e-11": dps.PresymplecticGauss(6, tolerance=1e-11),
+    "Gauss(8), 1e-11": dps.PresymplecticGauss(8, tolerance=1e-11),
+    "Coupled(4)": dps.PresymplecticCoupled(4),
+    "Coupled(6)": dps.PresymplecticCoupled(6),
 }
-TOLERANCES = 10.0 ** -np.arange(2, 14)
+THEIRS = {name: scheme.solver for name, scheme in DIFFRAX.items()} | {
+    "Kvaerno5": dfx.Kvaerno5()
+}
 
 
-def curves(system, times, y0, exact, repeats, quick):
-    """The errors and times of every solver, by its name."""
-    span = times[1] - times[0]
+def curves(system, times, y0, exact, longest, quick):
+    """The errors and times of every solver, by its group and name."""
+    span = float(times[1] - times[0])
     solve = eqx.filter_jit(final_state)
-
-    def run(solver, sweep, adaptive=False):
-        return partial(solve, system, solver, times, y0, adaptive=adaptive), sweep
-
-    most, points = (4e3, 4) if quick else (3e4, 16)
-    runs = {
-        name: run(
-            solver,
-            [
-                jnp.asarray(float(n))
-                for n in np.unique(
-                    np.geomspace(4 * span / 5, most / cost, points).astype(int)
-                )
-            ],
-        )
-        for name, (solver, cost) in FIXED.items()
-    }
+    factors = 2 ** (np.arange(0, 20 if quick else 40) / 2)
+    counts = [
+        jnp.asarray(float(n)) for n in np.unique(np.ceil(span / longest * factors))
+    ]
     tolerances = [jnp.asarray(tol) for tol in TOLERANCES[:: 3 if quick else 1]]
-    runs["Dopri8"] = run(dfx.Dopri8(scan_kind="lax"), tolerances, True)
-    return error_curves(runs, lambda y: relative_error(y, exact), repeats)
+    runs = {}
+    for name, solver in FIXED.items():
+        runs["ours", name] = partial(solve, system, solver, times, y0), counts
+    for name, solver in THEIRS.items():
+        run = partial(solve, system, solver, times, y0)
+        runs["Diffrax", name + ", adaptive"] = partial(run, adaptive=True), tolerances
+        if name != "Kvaerno5":
+            runs["Diffrax", name + ", constant"] = run, counts
+    error = lambda y: relative_error(y, exact)
+    longest_run = 0.5 if quick else 4.0
+    return error_curves(runs, error, 2 if quick else 5, (min(TARGETS), longest_run))
+
+
+def compare(options):
+    means = {kind: [] for kind in ("Diffrax", "Coupled")}
+    for problem, (make, longest) in PROBLEMS.items():
+        if options.only and not problem.startswith(tuple(options.only)):
+            continue
+        system, y0, t1 = make()
+        times = jnp.array([0.0, t1])
+        # Rounding accumulates over a long time.
+        finest = dict(tolerance=1e-11 if t1 > 1e3 else 1e-12, longest=longest / 2)
+        exact = jax.tree.map(lambda y: y[-1], reference(system, y0, times, **finest))
+        found = curves(system, times, y0, exact, longest, options.quick)
+        titles = (f"{target:.0e}:>9.2f" for target in TARGETS)
+        table = Table(f"{problem}: milliseconds to an error", "solver:<18", *titles)
+        for (_, name), curve in found.items():
+            reached = [_finite(time_to(curve, target)) for target in TARGETS]
+            table.row(name, *(x and 1e3 * x for x in reached))
+        gauss = lambda group, name: group == "ours" and "Gauss" in name
+        others = {
+            "Diffrax": lambda group, name: group == "Diffrax",
+            "Coupled": lambda group, name: "Coupled" in name,
+        }
+        for kind, chosen in others.items():
+            ratios = []
+            for target in TARGETS:
+                mine, other = (
+                    min(time_to(c, target) for key, c in found.items() if of(*key))
+                    for of in (gauss, chosen)
+                )
+                ratios.append(_finite(other / mine) if np.isfinite(mine) else None)
+            means[kind].append(ratios)
+            table.row(f"{kind} / Gauss", *ratios)
+        jax.clear_caches()
+    table = Table(
+        "Ratios of the best times, in geometric mean over the problems, and the least",
+        *("ratio:<22", *(f"{target:.0e}:>9.2f" for target in TARGETS)),
+    )
+    for kind, rows in means.items():
+        columns = [[x for x in column if x] for column in zip(*rows, strict=True)]
+        mean = (float(np.exp(np.mean(np.log(x)))) if x else None for x in columns)
+        table.row(f"{kind} / Gauss", *mean)
+        table.row("  the least", *(min(x, default=None) for x in columns))
+
+
+def _finite(x):
+    return float(x) if np.isfinite(x) else None
+
+
+# Long times.
+
+
+def long(quick):
+    """The energy error over a million steps: its size, and the slope of a fit."""
+    system, _, _ = chain(2, None)
+    y0 = jnp.array([1.0, 1.5]), jnp.zeros(2)
+    term, steps, saved = dps.HamiltonianTerm(system), 10**4 if quick else 10**6, 1000
+    table = Table(
+        f"Double pendulum without friction, {steps} steps of PresymplecticGauss(8)",
+        *("h:>6.3f", "largest energy error:>21.1e", "slope per step:>15.1e"),
+        *("its standard error:>19.1e", "ratio:>6.1f"),
+    )
+
+    @jax.jit
+    def errors(h):
+        ts = h * (steps // saved) * jnp.arange(1, saved + 1)
+        sol = dfx.diffeqsolve(
+            *(term, dps.PresymplecticGauss(8), 0.0, ts[-1], h, y0),
+            saveat=dfx.SaveAt(ts=ts),
+            adjoint=dps.FixedStepAdjoint(),
+            max_steps=None,
+        )
+        return jax.vmap(system.energy)(sol.ts, *sol.ys) / system.energy(0.0, *y0) - 1
+
+    for h in (0.01, 0.015, 0.02):
+        error = np.asarray(errors(jnp.asarray(h)))
+        n = np.arange(1, saved + 1) * (steps // saved)
+        slope = np.sum(n * error) / np.sum(n * n)
+        # Of a random walk, whose increments are independent, fitted through zero.
+        step = np.std(np.diff(error, prepend=0.0))
+        weights = np.cumsum(n[::-1])[::-1] / np.sum(n * n)
+        spread = step * np.sqrt(np.sum(weights**2))
+        table.row(h, np.max(np.abs(error)), slope, spread, slope / spread)
+
+
+# The same chains in MuJoCo, whose angles are those between neighbours.
+
+
+def hinges(n):
+    """The XML of a chain of rods of unit length and mass, with a damper in each joint.
+
+    The angles are relative to the link before.
+    """
+    text = '<mujoco><option gravity="0 0 -9.81"/><worldbody>'
+    for i in range(n):
+        text += (
+            f'<body pos="0 0 {0 if i == 0 else -1}"><joint type="hinge" axis="0 -1 0" '
+            f'damping="{damping(n)[i]}"/><inertial pos="0 0 -0.5" mass="1" '
+            f'diaginertia="{1 / 12!r} {1 / 12!r} 0.001"/>'
+        )
+    return text + "</body>" * n + "</worldbody></mujoco>"
+
+
+def damping(n):
+    return np.linspace(0.1, 0.3, n)
+
+
+def rods(n):
+    """The same as a `LagrangianSystem`: the mass matrix is J^T M J, for absolute angles
+    J q, about which M is known."""
+    total = np.tril(np.ones((n, n)))
+    # The centre of link k moves with all links before it, and half with its own.
+    reach = total - np.eye(n) / 2
+    products = reach.T @ reach
+
+    def mass(t, q, args):
+        angles = total @ q
+        cos = jnp.cos(angles[:, None] - angles[None, :])
+        return total.T @ (products * cos + np.eye(n) / 12) @ total
+
+    def potential(t, q, args):
+        return -GRAVITY * jnp.sum(reach @ jnp.cos(total @ q))
+
+    return dps.LagrangianSystem(mass, potential, jnp.asarray(damping(n)))
+
+
+def mujoco(quick):
+    problems = {}
+    for n, t1 in ((3, 10.0), (10, 5.0)):
+        y0 = jnp.linspace(1.0 if n == 3 else 0.3, 0.1, n), jnp.zeros(n)
+        problems[f"chain of {n} hinges"] = hinges(n), rods(n), y0, t1
+        theirs = mujoco_mass(hinges(n), y0[0])
+        if theirs is not None:
+            ours = rods(n).mass_matrix(0.0, y0[0])
+            difference = np.max(np.abs(ours - theirs)) / np.max(np.abs(theirs))
+            print(f"Mass matrix of {n} hinges, relative difference: {difference:.1e}")
+    gauss = {f"Gauss({s})": dps.PresymplecticGauss(s) for s in (3, 6)}
+    gauss["Gauss(4), 1e-8"] = dps.PresymplecticGauss(4, tolerance=1e-8)
+    mujoco_tables(problems, gauss, quick)
 
 
 def main():
-    options = command_line(__doc__).parse_args()
-    for problem, (system, y0, t1) in PROBLEMS.items():
-        times = jnp.array([0.0, t1])
-        exact = jax.tree.map(lambda y: y[-1], reference(system, y0, times))
-        repeats = 2 if options.quick else 7
-        found = curves(system, times, y0, exact, repeats, options.quick)
-        titles = (f"{target:.0e}:>9.2f" for target in TARGETS)
-        table = Table(f"{problem}: milliseconds to an error", "solver:<14", *titles)
-        for name, curve in found.items():
-            table.row(name, *(_milliseconds(curve, target) for target in TARGETS))
-        for other in ("Coupled", "Dopri8"):
-            ratios = []
-            for target in TARGETS:
-                gauss, theirs = (
-                    min(time_to(c, target) for n, c in found.items() if kind in n)
-                    for kind in ("Gauss", other)
-                )
-                reached = np.isfinite(gauss) and np.isfinite(theirs)
-                ratios.append(theirs / gauss if reached else None)
-            table.row(f"{other} / Gauss", *ratios)
-
-
-def _milliseconds(curve, target):
-    seconds = time_to(curve, target)
-    return 1e3 * seconds if np.isfinite(seconds) else None
+    parser = command_line(__doc__)
+    parser.add_argument("--only", nargs="*", help="beginnings of names of problems")
+    parser.add_argument("--mujoco", action="store_true")
+    parser.add_argument("--long", action="store_true")
+    options = parser.parse_args()
+    if options.mujoco:
+        mujoco(options.quick)
+    elif options.long:
+        long(options.quick)
+    else:
+        compare(options)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from jax.flatten_util import ravel_pytree
 import diffrax_presym as dps
 from diffrax_presym._scan import equations
 from diffrax_presym._solver._collocation import gauss_table
+from diffrax_presym.diagnostics._count import counted, Counter
 
 
 FINDER = optx.Newton(rtol=1e-12, atol=1e-12)
@@ -344,6 +345,19 @@ def test_iterations_that_do_not_converge_are_a_result():
         assert sol.stats["num_steps"] == 1
 
 
+def test_a_tolerance_ends_the_iteration_earlier():
+    def run(tolerance):
+        counter = Counter()
+        system = counted(FORCED, counter)
+        solver = dps.PresymplecticGauss(4, tolerance=tolerance)
+        y = solve(system, solver, 0.0, 2.0, 0.2, Y0).ys
+        return flat(y), counter.count
+
+    (exact, most), (loose, fewer) = run(0.0), run(1e-8)
+    assert 1e-14 < np.max(np.abs(loose - exact)) < 1e-7
+    assert fewer < 0.8 * most
+
+
 def stiff_energy(t, q, p, args):
     return (1 + jnp.sum(q**2)) * jnp.sum(p**2) / 2 + 1e4 * jnp.sum(q**2)
 
@@ -385,6 +399,8 @@ UNFINISHED = dfx.with_stepsize_controller_tols(optx.Newton)()
         (lambda: dps.PresymplecticGauss(True), "Python integer"),
         (lambda: dps.PresymplecticGauss(2, max_iterations=0), "at least 1"),
         (lambda: dps.PresymplecticGauss(2, UNFINISHED), "tolerance"),
+        (lambda: dps.PresymplecticGauss(2, tolerance=-1e-8), "at least 0"),
+        (lambda: dps.PresymplecticGauss(2, FINDER, tolerance=1e-8), "root finder"),
         (lambda: dps.PresymplecticGauss(2, WORD), "root finder"),
         (lambda: dps.LagrangianSystem(3.0, chain_potential), "M(t, q, args)"),
         (lambda: dps.LagrangianSystem(chain_mass, NOTHING), "V(t, q, args)"),
