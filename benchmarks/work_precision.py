@@ -103,12 +103,23 @@ def semi_implicit_euler(problem, ts=None):
     return mechanical
 
 
-def step_counts(problem, evaluations, quick):
-    """Numbers of steps by factors of the square root of two, from 0.4 per stage."""
+def step_counts(problem, evaluations, quick, saved=False):
+    """Numbers of steps by factors of the square root of two, from 0.4 per stage.
+
+    Where all of the times are `saved`, steps end at these times, or a few times at all
+    of them, as those of `choose_step` do.
+    """
     most = 4e3 if np.size(problem.q0) >= 1000 else 2e4 if quick else 1e5
     least = problem.t1 / (0.8 * evaluations * problem.unit)
     count = max(1, math.ceil(2 * math.log2(most / evaluations / least)))
-    return [jnp.asarray(math.ceil(least * 2 ** (k / 2))) for k in range(count)]
+    counts = [math.ceil(least * 2 ** (k / 2)) for k in range(count)]
+    if saved:
+        spans = SAVED - 1
+        divisors = [n for n in range(1, spans + 1) if spans % n == 0]
+        longer = lambda n: next((k for k in divisors if k >= n), None)
+        counts = [longer(n) or spans * math.ceil(n / spans) for n in counts]
+        counts = list(dict.fromkeys(counts))
+    return [jnp.asarray(n) for n in counts]
 
 
 def accepts(solver, problem, term):
@@ -129,17 +140,20 @@ def all_runs(problem, quick, ts=None):
     for name in OURS if separable else OTHERS:
         solver, _, evaluations = SCHEMES[name]
         if (problem.linear or "Linear" not in name) and accepts(solver, problem, term):
-            sweep = step_counts(problem, evaluations, quick)
+            sweep = step_counts(problem, evaluations, quick, ts is not None)
             runs["ours", name] = run_of(term, solver), sweep
     for name, (solver, _, evaluations) in DIFFRAX.items():
         tolerances = [jnp.asarray(x) for x in TOLERANCES]
         adaptive = run_of(term, solver, adaptive=True)
         runs["diffrax", f"{name}, adaptive"] = adaptive, tolerances
-        sweep = step_counts(problem, evaluations, quick)
+        sweep = step_counts(problem, evaluations, quick, ts is not None)
         runs["diffrax", f"{name}, constant"] = run_of(term, solver), sweep
     if separable and isinstance(problem.q0, np.ndarray):
         run = semi_implicit_euler(problem, ts)
-        runs["diffrax", "SemiImplicitEuler"] = run, step_counts(problem, 1, quick)
+        runs["diffrax", "SemiImplicitEuler"] = (
+            run,
+            step_counts(problem, 1, quick, ts is not None),
+        )
     if problem.rhs is None or ts is not None:
         return runs
     tolerances = TOLERANCES[1::4] if quick else TOLERANCES
