@@ -107,6 +107,15 @@ def test_pages_draw_the_pictures_they_show(page):
     assert all((ROOT / "docs" / "img" / name).is_file() for name in shown)
 
 
+def test_recipes_for_other_libraries_are_those_of_the_examples():
+    blocks = list(FENCE.finditer((ROOT / "docs" / "howto" / "clients.md").read_text()))
+    recipes = [x["code"] for x in blocks if x["code"].startswith("# examples/")]
+    assert len(recipes) == len(list((ROOT / "examples" / "clients").glob("[!_]*.py")))
+    for recipe in recipes:
+        first, code = recipe.split("\n", 1)
+        assert code in (ROOT / first[2:].split(",")[0]).read_text()
+
+
 def test_every_public_name_is_in_the_api():
     api = "\n".join(x.read_text() for x in (ROOT / "docs" / "api").glob("*.md"))
     shown = re.findall(r"^::: diffrax_presym\.([\w.]+)$", api, re.MULTILINE)
