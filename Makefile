@@ -70,7 +70,7 @@ docs: $(VENV)/.with-docs  ## Build the documentation into site/
 serve: $(VENV)/.with-docs  ## Serve the documentation with live reload
 	@$(BIN)/mkdocs serve
 
-tutorials: $(VENV)/.with-examples  ## Run the tutorials and save their figures
+tutorials: $(VENV)/.with-examples  ## Run tutorials and how-to pages, save their figures
 	@$(BIN)/python docs/_tutorials.py
 
 examples: $(VENV)/.with-examples  ## Run a short version of every example

@@ -20,9 +20,9 @@ import diffrax_presym as dps
 
 ROOT = pathlib.Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
-TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 SCRIPT = runpy.run_path(str(ROOT / "docs" / "_tutorials.py"))
 FENCE, python_blocks = SCRIPT["FENCE"], SCRIPT["python_blocks"]
+FIGURES = SCRIPT["pages_with_figures"]()
 PUBLIC = {
     name: value
     for name, value in vars(dps).items()
@@ -93,14 +93,27 @@ def test_blocks_say_their_language(page):
     assert languages <= {"bash", "bibtex", "python", "sh", "text"}
 
 
-@pytest.mark.parametrize("page", TUTORIALS, ids=lambda x: x.stem)
-def test_tutorials_draw_the_pictures_they_show(page):
+def test_pages_with_figures_have_names_of_their_own():
+    assert len({page.stem for page in FIGURES}) == len(FIGURES)
+
+
+@pytest.mark.parametrize("page", FIGURES, ids=lambda x: x.stem)
+def test_pages_draw_the_pictures_they_show(page):
     text = page.read_text()
     shown = re.findall(r"!\[[^\]]+\]\(\.\./img/([^)]+)\)", text)
     code = "\n".join(python_blocks(text))
     assert shown == re.findall(r"savefig\(\"([^\"]+)\"", code)
-    assert shown == [f"tutorial_{page.stem}.png"]
+    assert shown == [FIGURES[page]]
     assert all((ROOT / "docs" / "img" / name).is_file() for name in shown)
+
+
+def test_recipes_for_other_libraries_are_those_of_the_examples():
+    blocks = list(FENCE.finditer((ROOT / "docs" / "howto" / "clients.md").read_text()))
+    recipes = [x["code"] for x in blocks if x["code"].startswith("# examples/")]
+    assert len(recipes) == len(list((ROOT / "examples" / "clients").glob("[!_]*.py")))
+    for recipe in recipes:
+        first, code = recipe.split("\n", 1)
+        assert code in (ROOT / first[2:].split(",")[0]).read_text()
 
 
 def test_every_public_name_is_in_the_api():

@@ -432,6 +432,27 @@ def test_equal_weights_ask_nothing_of_the_base():
     dps.Composition(dps.PresymplecticEuler(), [0.5, 0.5])
 
 
+MATRIX_FRICTION = dps.HamiltonianTerm(
+    dps.MechanicalSystem(KINETIC, harmonic, dps.ViscousDamping(jnp.eye(2)))
+)
+
+
+@pytest.mark.parametrize(
+    "solver, term",
+    [(LEAPFROG, TERM), (dps.TunedRKN6(), MATRIX_FRICTION)],
+    ids=["the last force", "exponentials"],
+)
+def test_steps_without_a_solver_state_that_is_needed(solver, term):
+    mistake = Mistake("got `solver_state=None`", "has a solver state", "solver.init(")
+    with pytest.raises(ValueError) as error:
+        solver.step(term, 0.0, 0.1, PAIR, None, None, made_jump=False)
+    mistake.check(error)
+    state = solver.init(term, 0.0, 0.1, PAIR, None)
+    solver.step(term, 0.0, 0.1, PAIR, None, state, made_jump=False)
+    without = dps.PresymplecticLeapfrog("position")
+    without.step(TERM, 0.0, 0.1, PAIR, None, None, made_jump=False)
+
+
 # Hamiltonians
 
 POSITIVE = "must be positive"
@@ -593,6 +614,10 @@ HAMILTONIANS = {
     "damping by a number": (
         lambda: dps.ConformalHamiltonian(KINETIC, harmonic, 0.2),
         Mistake("got 0.2", LAW, RATE),
+    ),
+    "damping by coefficients": (
+        lambda: dps.ConformalHamiltonian(KINETIC, harmonic, dps.ViscousDamping(1.0)),
+        Mistake("got ViscousDamping", LAW, "`MechanicalSystem(kinetic, potential,"),
     ),
     "damping of the general family by a number": (
         lambda: dps.DissipativeHamiltonian(KINETIC, harmonic, DAMPING, 0.2),

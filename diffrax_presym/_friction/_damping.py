@@ -470,5 +470,7 @@ def as_damping(damping, name: str) -> AbstractDamping:
         return CallableDamping(damping)
     raise ValueError(
         f"{name} must be a damping law or a function eta(t), but got {damping!r}. For "
-        "friction at a constant rate write `ConstantDamping(rate)`."
+        "friction at a constant rate write `ConstantDamping(rate)`; for friction by "
+        "coefficients, by place or by speed "
+        "`MechanicalSystem(kinetic, potential, friction=law)`."
     )

@@ -4,6 +4,7 @@ from functools import partial
 from typing import ClassVar, Generic, NamedTuple, TYPE_CHECKING, TypeVar
 
 import diffrax as dfx
+import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -193,6 +194,15 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         system = as_system(terms, args)
+        if solver_state is None:
+            needed = eqx.filter_eval_shape(self.init, terms, t0, t1, y0, args)
+            if jtu.tree_leaves(needed):
+                raise ValueError(
+                    f"`{type(self).__name__}` has a solver state for this system, but "
+                    "got `solver_state=None`. Write `solver_state = solver.init(terms, "
+                    "t0, t1, y0, args)` before the first step, and pass on the one "
+                    "that each step returns."
+                )
         if not isinstance(solver_state, Tabulated):
             return self._step(system, t0, t1, y0, solver_state, made_jump)
         carry, table = solver_state
