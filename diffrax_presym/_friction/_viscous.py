@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Bool, Inexact, PyTree
 
@@ -159,6 +160,11 @@ class RayleighDamping(eqx.Module):
         self.stiffness = as_form(
             stiffness, name.format("..., stiffness"), positive=False
         )
+
+    @property
+    def without_stiffness(self) -> bool:
+        """Whether it is known to be friction in proportion to the mass alone."""
+        return not isinstance(self.beta, Tracer) and bool(self.beta == 0)
 
 
 def as_friction(

@@ -86,8 +86,10 @@ class LagrangianSystem(AbstractHamiltonian):
             number.
         - `friction`: the coefficients `C` of the friction `-C v`, in units of force per
             velocity (torque per angular velocity for an angle): a number, an array of
-            shape `(n,)` with one for each joint, a matrix of shape `(n, n)` or a
-            `lineax.AbstractLinearOperator`. Defaults to no friction.
+            shape `(n,)` with one for each entry of `q`, a matrix of shape `(n, n)` or a
+            `lineax.AbstractLinearOperator`. A damper acts on the angle of its joint:
+            if `q` are angles from the vertical, and `J @ q` those of the joints, pass
+            `J.T @ jnp.diag(dampers) @ J`. Defaults to no friction.
         - `force`: any further generalised force, a function `f(t, q, v, args)` of the
             velocity `v` that returns an array of shape `(n,)`: a motor, a controller,
             drag. Defaults to none.

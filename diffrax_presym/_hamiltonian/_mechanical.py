@@ -62,11 +62,12 @@ class MechanicalSystem(AbstractHamiltonian):
     !!! example
 
         ```python
-        # A chain with a damper at every joint.
-        stiffness = lambda t, q, args: jnp.sum(1 - jnp.cos(jnp.diff(q, prepend=0.0)))
-        dampers = jnp.array([0.1, 0.2, 0.5])
+        # Three wheels on a shaft, with a damper in each of its elastic sections.
+        sections = jnp.eye(3) - jnp.eye(3, k=-1)
+        shaft = lambda t, q, args: jnp.sum(1 - jnp.cos(sections @ q))
+        dampers = sections.T @ jnp.diag(jnp.array([0.1, 0.2, 0.5])) @ sections
         system = MechanicalSystem(
-            QuadraticKinetic(mass=2.0), stiffness, friction=ViscousDamping(dampers)
+            QuadraticKinetic(mass=2.0), shaft, friction=ViscousDamping(dampers)
         )
         sol = diffeqsolve(
             HamiltonianTerm(system), TunedRKN6(),
@@ -134,7 +135,7 @@ class MechanicalSystem(AbstractHamiltonian):
                 "as `MechanicalSystem(..., force=f)`, with a function "
                 "`f(t, q, v, args)` such as `lambda t, q, v, args: -C @ v`."
             )
-        if isinstance(law, RayleighDamping):
+        if isinstance(law, RayleighDamping) and not law.without_stiffness:
             known = isinstance(self._potential, QuadraticPotential)
             if law.stiffness is None and not known:
                 raise ValueError(

@@ -71,8 +71,9 @@ class AbstractSplitting(AbstractMoveSolver[PyTree]):
                 f"potential, but this `{system.name}` is not. "
                 "If it is a sum of the two, give its parts: `SeparableHamiltonian("
                 "kinetic, potential)` or `ConformalHamiltonian(kinetic, potential, "
-                "damping)`. Otherwise use `PresymplecticCoupled()`, or with a force "
-                "that depends on the velocity `PresymplecticGauss()`."
+                "damping)`. A `MechanicalSystem(..., force=f)` and a "
+                "`LagrangianSystem` have no such parts: use `PresymplecticGauss()`, or "
+                "for energies `PresymplecticCoupled()`."
             )
         raise ValueError(
             f"`{name}` keeps its order only for a quadratic kinetic energy, written as "
