@@ -220,8 +220,8 @@ def _adaptive_steps(problem, solver, tolerance):
 
 @eqx.filter_jit
 def _count(system, solver, t1, y0, controller):
-    options = dict(max_steps=10**5)  # A motion that escapes would never end.
-    sol = solve(system, solver, 0.0, t1, None, y0, None, controller, **options)
+    # A motion that escapes would never end.
+    sol = solve(system, solver, 0.0, t1, None, y0, None, controller, max_steps=10**5)
     return sol.stats["num_steps"]
 
 

@@ -141,7 +141,7 @@ def main():
         f"{'asked':>7} {'predicted':>10} {'found':>8} {'steps':>6} {'solve':>8} "
         f"{'Diffrax at this error':>23} {'gradient of 6 dampers':>22}"
     )
-    curves = {}
+    curves, ys = {}, None
     for tolerance in (1e-6,) if options.quick else (1e-3, 1e-6, 1e-9):
         chosen = dps.choose_step(
             *(term, SOLVER, 0.0, T1, Y0), rtol=0.0, atol=tolerance, ts=TS

@@ -1,5 +1,7 @@
 """Functions that XLA computes slowly."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import mpmath
@@ -24,7 +26,7 @@ def test_to_one_unit_in_the_last_place(name):
     # The numbers next to the zeros.
     x = np.concatenate([*x, quarters, np.nextafter(quarters, 9), [0.0, 5e-324]])
     with mpmath.workdps(60):
-        values = [exact(mpmath.mpf(float(v))) for v in x]
+        values: list[Any] = [exact(mpmath.mpf(float(v))) for v in x]
         found = np.asarray(jax.jit(function)(x))
         errors = [
             abs(mpmath.mpf(float(a)) - b) / float(np.spacing(abs(float(b))))

@@ -8,7 +8,7 @@ import numpy as np
 
 import diffrax_presym as dps
 from examples.paper._common import parser, report
-from examples.quickstart import (
+from examples.schemes import (
     DAMPED,
     damped_exact,
     DECAYING,

@@ -8,7 +8,7 @@ import numpy as np
 import diffrax_presym as dps
 from examples.paper._common import growth, parser, report
 from examples.paper.exact_solutions import solve, SYSTEMS
-from examples.quickstart import hamiltonian_error, slope
+from examples.schemes import hamiltonian_error, slope
 
 
 SCHEMES = {

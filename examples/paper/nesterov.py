@@ -7,7 +7,7 @@ import diffrax_presym as dps
 from examples.paper._common import growth, Nesterov, parser, report
 from examples.paper.exact_solutions import HIGH, solve
 from examples.paper.hamiltonian_error import envelope
-from examples.quickstart import harmonic, system
+from examples.schemes import harmonic, system
 
 
 METHODS = {

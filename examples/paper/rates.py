@@ -10,7 +10,7 @@ import diffrax_presym as dps
 from examples.paper._common import Nesterov, parser, report
 from examples.paper.exact_solutions import HIGH, solve
 from examples.paper.hamiltonian_error import envelope
-from examples.quickstart import DAMPED, DECAYING, harmonic, slope, system
+from examples.schemes import DAMPED, DECAYING, harmonic, slope, system
 
 
 SYSTEMS = {
