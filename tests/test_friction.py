@@ -47,8 +47,12 @@ def test_operators_solve_the_equation_of_friction(law):
     left, travelled = after(p0, zero)
     gained, _ = after(zero, force)
     np.testing.assert_allclose(p0 + law.decay(*times, jnp.asarray(p0)), left, 1e-10)
-    np.testing.assert_allclose(law.carry(*times, p0, order=12), travelled, 1e-10)
-    np.testing.assert_allclose(law.respond(*times, force, order=12), gained, 1e-10)
+    np.testing.assert_allclose(
+        law.carry(*times, jnp.asarray(p0), order=12), travelled, 1e-10
+    )
+    np.testing.assert_allclose(
+        law.respond(*times, jnp.asarray(force), order=12), gained, 1e-10
+    )
     grown = law.amplification(*times, jnp.asarray(p0))
     np.testing.assert_allclose(grown, p0 / left, 1e-10)
 
