@@ -11,6 +11,20 @@ from _solve import last, solve
 from _timing import interleaved
 
 
+def _engine() -> Any:
+    """MuJoCo, or `None` where it is not installed."""
+    try:
+        return importlib.import_module("mujoco")
+    except ImportError:
+        return None
+
+
+def _at(mujoco, model, q):
+    data = mujoco.MjData(model)
+    data.qpos[:] = q
+    return data
+
+
 @eqx.filter_jit
 def _end(system, t1, y0, solver, dt0):
     return last(solve(system, solver, 0.0, t1, dt0, y0))
@@ -22,9 +36,8 @@ def mujoco_tables(problems, solvers, quick):
     A problem is the XML of a model, our system, its initial state and the final time.
     MuJoCo loads a model once; a time is that of its steps.
     """
-    try:
-        mujoco: Any = importlib.import_module("mujoco")
-    except ImportError:
+    mujoco = _engine()
+    if mujoco is None:
         print("\nMuJoCo is not installed: pip install mujoco")
         return
     kinds = mujoco.mjtIntegrator
@@ -38,8 +51,7 @@ def mujoco_tables(problems, solvers, quick):
 
         def simulate(integrator, steps, model=model, q0=q0, t1=t1):
             model.opt.integrator, model.opt.timestep = integrator, t1 / steps
-            data = mujoco.MjData(model)
-            data.qpos[:] = q0
+            data = _at(mujoco, model, q0)
             mujoco.mj_step(model, data, nstep=steps)
             return data.qpos.copy(), data.qvel.copy()
 
@@ -54,7 +66,7 @@ def mujoco_tables(problems, solvers, quick):
             f"MuJoCo, {name}, to t = {t1}",
             *("integrator:<24", "steps:>7", "error:>9.1e", "milliseconds:>13.3f"),
         )
-        calls, errors = {}, {}
+        calls = {}
         for label, kind in integrators.items():
             for steps in (1000, 4000, 16000):
                 calls[f"MuJoCo {label}", steps] = partial(simulate, kind, steps)
@@ -67,20 +79,17 @@ def mujoco_tables(problems, solvers, quick):
             found = timing.result
             if not label.startswith("MuJoCo"):
                 found = found[0], system.velocity(0.0, *found)
-            errors[label, steps] = error([np.asarray(x) for x in found])
-            milliseconds = 1e3 * timing.median
-            table.row(label, str(steps), errors[label, steps], milliseconds)
+            off = error([np.asarray(x) for x in found])
+            table.row(label, str(steps), off, 1e3 * timing.median)
 
 
 def mujoco_mass(xml, q):
     """MuJoCo's mass matrix at a place, or `None` where MuJoCo is not installed."""
-    try:
-        mujoco: Any = importlib.import_module("mujoco")
-    except ImportError:
+    mujoco = _engine()
+    if mujoco is None:
         return None
     model = mujoco.MjModel.from_xml_string(xml)
-    data = mujoco.MjData(model)
-    data.qpos[:] = q
+    data = _at(mujoco, model, q)
     mujoco.mj_forward(model, data)
     mass = np.zeros((model.nv, model.nv))
     for column, unit in zip(mass, np.eye(model.nv), strict=True):

@@ -10,7 +10,7 @@ if they take more than a million steps.
 
 The other tables are batches of 1024: damped Henon-Heiles systems, whose force is a
 polynomial, and the pendulums with what else matters on a CPU: the sine, which XLA
-evaluates one by one in double precision, written as a polynomial; and the batch cut
+evaluates one by one in double precision, from `diffrax_presym.math`; and the batch cut
 into blocks, `jax.lax.map(solve, y0, batch_size=512)`, too small for XLA to spread each
 operation over threads, which costs more than it gains at this size. heyoka is
 measured if it is installed, as it is used for many trajectories: one after the other,
