@@ -358,6 +358,40 @@ def test_a_tolerance_ends_the_iteration_earlier():
     assert fewer < 0.8 * most
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "wrap, h, dtype",
+    [
+        (lambda x: x, 0.2, jnp.float32),
+        (dps.Checked, -0.2, jnp.float64),
+        (dps.Compensated, 0.2, jnp.float64),
+    ],
+)
+def test_a_tolerance_in_wrappers_batches_and_gradients(wrap, h, dtype):
+    def energy(t, q, p, args):
+        return (2 + jnp.sum(q**2)) * (1 + jnp.sum(p**2)) / 4
+
+    system = dps.ConformalHamiltonian(energy=energy, damping=dps.ConstantDamping(0.3))
+    many = jax.tree.map(lambda x: jnp.stack([x, -x / 2]).astype(dtype), Y0)
+    tolerance, within = (1e-8, 1e-6) if dtype == jnp.float64 else (1e-4, 1e-2)
+    # A state is promoted to the precision of the times.
+    times = jnp.asarray([0.0, 10 * h, h], dtype)
+    options = dict(
+        saveat=dfx.SaveAt(ts=jnp.array([0.3, 1.0, 1.7], dtype) * (1 if h > 0 else -1)),
+        adjoint=dps.FixedStepAdjoint(),
+    )
+
+    def loss(y, tolerance):
+        solver = wrap(dps.PresymplecticGauss(4, tolerance=tolerance))
+        one = lambda y: solve(system, solver, *times, y, **options).ys
+        q, p = jax.vmap(one)(y)
+        assert q.dtype == p.dtype == dtype
+        return jnp.sum(q**2) + jnp.sum(p**2)
+
+    loose, exact = (jax.value_and_grad(loss)(many, x) for x in (tolerance, 0.0))
+    assert_close(loose, exact, within)
+
+
 def stiff_energy(t, q, p, args):
     return (1 + jnp.sum(q**2)) * jnp.sum(p**2) / 2 + 1e4 * jnp.sum(q**2)
 
