@@ -375,7 +375,7 @@ def test_a_tolerance_in_wrappers_batches_and_gradients(wrap, h, dtype):
     many = jax.tree.map(lambda x: jnp.stack([x, -x / 2]).astype(dtype), Y0)
     tolerance, within = (1e-8, 1e-6) if dtype == jnp.float64 else (1e-4, 1e-2)
     # A state is promoted to the precision of the times.
-    times = jnp.asarray([0.0, 10 * h, h], dtype)
+    t0, t1, dt = (jnp.asarray(t, dtype) for t in (0.0, 10 * h, h))
     options = dict(
         saveat=dfx.SaveAt(ts=jnp.array([0.3, 1.0, 1.7], dtype) * (1 if h > 0 else -1)),
         adjoint=dps.FixedStepAdjoint(),
@@ -383,7 +383,7 @@ def test_a_tolerance_in_wrappers_batches_and_gradients(wrap, h, dtype):
 
     def loss(y, tolerance):
         solver = wrap(dps.PresymplecticGauss(4, tolerance=tolerance))
-        one = lambda y: solve(system, solver, *times, y, **options).ys
+        one = lambda y: solve(system, solver, t0, t1, dt, y, **options).ys
         q, p = jax.vmap(one)(y)
         assert q.dtype == p.dtype == dtype
         return jnp.sum(q**2) + jnp.sum(p**2)
