@@ -119,11 +119,11 @@ PROBLEMS = {
     "double pendulum": (partial(chain, 2), 0.5),
     "chain of 3": (partial(chain, 3), 0.3),
     "chain of 10": (partial(chain, 10), 0.1),
-    "charged particle": (charged_particle, 1.0),
-    "geodesic on an ellipsoid": (ellipsoid, 1.0),
-    "relativistic charge": (relativistic, 1.0),
-    "orbit around a black hole": (black_hole, 60.0),
-    "(q^2 + 1)(p^2 + 1)/2": (partial(mixed, 1e4), 0.3),
+    "charged particle": (charged_particle, 3.0),
+    "geodesic on an ellipsoid": (ellipsoid, 2.0),
+    "relativistic charge": (relativistic, 2.0),
+    "orbit around a black hole": (black_hole, 200.0),
+    "(q^2 + 1)(p^2 + 1)/2": (partial(mixed, 1e4), 1.0),
 }
 FIXED = {
     **{f"Gauss({s})": dps.PresymplecticGauss(s) for s in (3, 4, 6, 8)},

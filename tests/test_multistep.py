@@ -250,6 +250,32 @@ def test_a_change_of_the_step_starts_again():
     assert_close(uneven, exact, 1e-9)
 
 
+@pytest.mark.parametrize("wrap", [lambda x: x, dps.Compensated])
+def test_a_change_of_the_step_is_not_undone(wrap):
+    """What is known of the steps before it is dropped, so that reversal is refused."""
+    term = dps.HamiltonianTerm(system(LAWS["constant"]))
+    ts = jnp.concatenate([jnp.linspace(0.0, 2, 21), 2 + jnp.linspace(0, 2, 41)[1:]])
+
+    @eqx.filter_jit
+    def loss(x, adjoint):
+        sol = dfx.diffeqsolve(
+            *(term, wrap(dps.SymmetricMultistep(8)), 0.0, 4.0, None),
+            jax.tree.map(lambda y: x * y, Y0),
+            args=ONE,
+            stepsize_controller=dfx.StepTo(ts),
+            adjoint=adjoint,
+            max_steps=64,
+        )
+        assert sol.ys is not None
+        return jnp.sum(sol.ys[0] ** 2)
+
+    slope = jax.grad(loss)(ONE, dps.FixedStepAdjoint())
+    up, down = (loss(x, dps.FixedStepAdjoint()) for x in (ONE + 1e-5, ONE - 1e-5))
+    assert_close(slope, (up - down) / 2e-5, 1e-8)
+    with pytest.raises(RuntimeError, match="FixedStepAdjoint"):
+        jax.block_until_ready(jax.grad(loss)(ONE, dps.ReversibleAdjoint()))
+
+
 def test_a_jump_starts_again():
     def pushed(t, q, args):
         return pendulum(t, q, args) - jnp.where(t < args, 0, 1.0) * jnp.sum(q)

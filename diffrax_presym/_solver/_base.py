@@ -102,6 +102,10 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         """
         return self if self.is_symmetric else None
 
+    def undoable(self, carry: _Carry) -> Array | None:
+        """Whether all steps up to this solver state can be undone; `None` if always."""
+        return None
+
     def moves(self, system: System) -> Moves:
         """The moves of a step; by default the whole step is one move."""
         return step_of(self)
@@ -307,6 +311,9 @@ class AbstractWrapper(AbstractMoveSolver[_Carry], Generic[_Carry]):
 
     def step_length(self, t0: Array, t1: Array) -> Array:
         return self.base.step_length(t0, t1)
+
+    def undoable(self, carry: PyTree) -> Array | None:
+        return self.base.undoable(carry)
 
     def composition_error(self) -> str | None:
         return self.base.composition_error() or super().composition_error()

@@ -58,6 +58,7 @@ class _Carry(NamedTuple):
     momentum: PyTree[Sum]  # the mean over the step
     force: PyTree  # at the end of the step
     filter: PyTree[Inexact[Array, "lags ..."]]  # the state of the filter of forces
+    dropped: Inexact[Array, ""]  # 1 if some history was dropped, otherwise 0
 
 
 class SymmetricMultistep(AbstractMoveSolver[_Carry]):
@@ -95,8 +96,8 @@ class SymmetricMultistep(AbstractMoveSolver[_Carry]):
     steps after a jump and those close to a singularity of the friction are steps of
     [`diffrax_presym.BlanesCasasRKN8`][], of 19 evaluations. So no force is evaluated
     outside of the steps. Each step is reversible to rounding, and
-    [`diffrax_presym.ReversibleAdjoint`][] takes its gradient, but not back through a
-    change of the step after the first `order - 1` steps.
+    [`diffrax_presym.ReversibleAdjoint`][] takes its gradient, but with an error refuses
+    to go back through a change of the step after the first `order - 1` steps.
 
     ??? cite "Reference"
 
@@ -196,7 +197,10 @@ class SymmetricMultistep(AbstractMoveSolver[_Carry]):
         many = jtu.tree_map(lambda x: jnp.zeros((count, *x.shape), x.dtype), nothing)
         zero = jnp.zeros((), jnp.result_type(t))
         sums = _as_sums(nothing)
-        return _Carry(zero, zero, nothing, nothing, sums, nothing, many)
+        return _Carry(zero, zero, nothing, nothing, sums, nothing, many, zero)
+
+    def undoable(self, carry: _Carry) -> Array:
+        return carry.dropped == 0
 
     def moves(self, system: System) -> Moves:
         split = self.split(system)
@@ -268,7 +272,12 @@ class _Step:
         p1 = _pick(starting, (values(first_p), p_lost), (p1, nothing))
         p1 = jtu.tree_map(Sum, *p1)
         lost = rounding_errors(q), _pick(starting, p_lost, kept)
-        new = _Carry(known + 1, cast_to(h, old.h), *lost, momentum, force, filter)
+        # Of a history that is not used any more the end of the step knows nothing.
+        dropped = (known < old.count) & (old.count >= self.table.order)
+        new = _Carry(
+            *(known + 1, cast_to(h, old.h), *lost, momentum, force, filter),
+            jnp.where(dropped, 1, old.dropped),
+        )
         return _from_sums((q, p1), y), new
 
     def backward(self, stage: Stage) -> Stage:
@@ -306,8 +315,10 @@ class _Step:
         kept = _pick(starting | first_step, rounding_errors(p), new.p_lost)
         lost = rounding_errors(q), kept
         # The rest of the history is of no use in the steps at the start.
-        rest = _pick(starting, new[4:], (momentum, force, filter))
-        old = _Carry(jnp.maximum(known, 0), cast_to(-h, new.h), *lost, *rest)
+        history = new.momentum, new.force, new.filter
+        rest = _pick(starting, history, (momentum, force, filter))
+        count = jnp.maximum(known, 0)
+        old = _Carry(count, cast_to(-h, new.h), *lost, *rest, new.dropped)
         return _from_sums((q, p), y), old
 
     def _known(self, carry: _Carry) -> Array:
