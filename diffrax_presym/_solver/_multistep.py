@@ -316,9 +316,9 @@ class _Step:
         lost = rounding_errors(q), kept
         # The rest of the history is of no use in the steps at the start.
         history = new.momentum, new.force, new.filter
-        rest = _pick(starting, history, (momentum, force, filter))
-        count = jnp.maximum(known, 0)
-        old = _Carry(count, cast_to(-h, new.h), *lost, *rest, new.dropped)
+        momentum, force, filter = _pick(starting, history, (momentum, force, filter))
+        count, length = jnp.maximum(known, 0), cast_to(-h, new.h)
+        old = _Carry(count, length, *lost, momentum, force, filter, new.dropped)
         return _from_sums((q, p), y), old
 
     def _known(self, carry: _Carry) -> Array:
