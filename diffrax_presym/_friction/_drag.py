@@ -35,7 +35,8 @@ class Drag(eqx.Module):
     [`diffrax_presym.Strang`][], [`diffrax_presym.BlanesMoan4`][] and
     [`diffrax_presym.BlanesMoan6`][] keep their order;
     Runge--Kutta--Nyström splittings would not, and refuse it. No structure is kept but
-    the symmetry.
+    the symmetry. In a steady wind, solve in the frame of the air: with velocities
+    relative to the wind $w$, and positions $q - w t$.
 
     If the coefficient depends on place the drag is part of the kicks. There, and where
     other friction is added, its flow is a symmetric composition, of the order of the
