@@ -36,7 +36,7 @@ demo: $(VENV)/.with-examples  ## Run the quick start: print its tables and save 
 test: $(VENV)/.with-tests  ## Run the tests, except the slow ones
 	@$(BIN)/python $(PYTEST) -m "not slow"
 
-# `make slow PART=1/4` runs the first quarter of them.
+# `make slow PART=1/8` runs one eighth of them.
 slow: $(VENV)/.with-tests  ## Run the slow tests
 	@$(BIN)/python $(PYTEST) -m slow $(if $(PART),--part $(PART))
 
