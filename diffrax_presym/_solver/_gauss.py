@@ -147,8 +147,9 @@ class PresymplecticGauss(AbstractPresymplecticSolver[_Carry]):
         - `tolerance`: the relative change of the stages below which the fixed-point
             iteration may end, a Python float. Symmetry and structure are then kept to
             this tolerance only, and so are steps that `ReversibleAdjoint` takes
-            backwards, whose `tol` must be larger. A hundredth of the error that is wanted saves up to half of the
-            iterations. Defaults to 0, for iteration to rounding.
+            backwards, whose `tol` must be larger. A hundredth of the error that is
+            wanted saves up to half of the iterations. Defaults to 0, for iteration to
+            rounding.
 
         **Raises:**
 
