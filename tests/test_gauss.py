@@ -384,7 +384,8 @@ def test_a_tolerance_in_wrappers_batches_and_gradients(wrap, h, dtype):
     def loss(y, tolerance):
         solver = wrap(dps.PresymplecticGauss(4, tolerance=tolerance))
         one = lambda y: solve(system, solver, t0, t1, dt, y, **options).ys
-        q, p = jax.vmap(one)(y)
+        ys: Any = jax.vmap(one)(y)
+        q, p = ys
         assert q.dtype == p.dtype == dtype
         return jnp.sum(q**2) + jnp.sum(p**2)
 
