@@ -93,7 +93,7 @@ SLOW = re.compile(
             r"test_mechanical.*(saved_times_and_steps|any_force|energy_balance.all)",
             r"test_mechanical.*test_(order|events)\[(matrix|drag)",
             r"test_multistep.*(checkpoints\[logarithmic|at_steps|drift\[1|float32)",
-            r"test_multistep.*(does_not_drift.8|change_of_the_step)",
+            r"test_multistep.*(does_not_drift.8|change_of_the_step_starts)",
             r"test_multistep.*(finite_differences|backwards_in_time|vmap|a_jump_starts)",
             r"test_multistep.*(first_steps_after_a_singularity|test_wrappers)",
             r"test_multistep.*test_order\[(10|8-(mixed|function|excitation))",

@@ -126,15 +126,15 @@ class ReversibleAdjoint(AbstractFixedStepAdjoint):
             at = lax.cond((first > 0) & (at.n > 0), redo, lambda at: at, at)
             at = backward.back_to(at, jnp.asarray(0), lambda n: None)
         at = backward.start(at)
-        undoable = plan.solver.undoable(trace.end[1])
+        undoable = plan.solver.undoable(plan.start[1], trace.end[1])
         if undoable is not None:
             at = eqx.error_if(
                 at,
                 ~undoable,
                 "`ReversibleAdjoint` cannot undo this solve: its steps change in "
-                "length, or its friction abruptly, and there "
-                f"`{type(plan.solver).__name__}` starts again without its history. Use "
-                "steps of one length, or `diffrax_presym.FixedStepAdjoint()`.",
+                "length, or its friction abruptly, and there a multistep method starts "
+                "again without its history. Use steps of one length, or "
+                "`diffrax_presym.FixedStepAdjoint()`.",
             )
         # A solve that diverged has a gradient of NaN anyway.
         missed = ~(miss <= self.limit(at.state[0])[0]) & all_finite(trace.end[0])

@@ -102,8 +102,8 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         """
         return self if self.is_symmetric else None
 
-    def undoable(self, carry: _Carry) -> Array | None:
-        """Whether all steps up to this solver state can be undone; `None` if always."""
+    def undoable(self, start: _Carry, end: _Carry) -> Array | None:
+        """Whether steps between two solver states can be undone; `None` if always."""
         return None
 
     def moves(self, system: System) -> Moves:
@@ -312,8 +312,8 @@ class AbstractWrapper(AbstractMoveSolver[_Carry], Generic[_Carry]):
     def step_length(self, t0: Array, t1: Array) -> Array:
         return self.base.step_length(t0, t1)
 
-    def undoable(self, carry: PyTree) -> Array | None:
-        return self.base.undoable(carry)
+    def undoable(self, start: PyTree, end: PyTree) -> Array | None:
+        return self.base.undoable(start, end)
 
     def composition_error(self) -> str | None:
         return self.base.composition_error() or super().composition_error()

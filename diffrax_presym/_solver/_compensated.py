@@ -79,8 +79,8 @@ class Compensated(AbstractWrapper[PyTree]):
         moves = to_sums, self.base.moves(system), to_sums.inverse
         return Stages(moves, [(0, 0, 0), (0, 1, 1), (1, 1, 0)])
 
-    def undoable(self, carry: PyTree) -> Array | None:
-        return self.base.undoable(carry[0])
+    def undoable(self, start: PyTree, end: PyTree) -> Array | None:
+        return self.base.undoable(start[0], end[0])
 
     def slope(self, system: System, t: Array, y: State, carry: PyTree) -> State:
         return self.base.slope(system, t, y, carry[0])

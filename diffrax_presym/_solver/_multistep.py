@@ -58,7 +58,7 @@ class _Carry(NamedTuple):
     momentum: PyTree[Sum]  # the mean over the step
     force: PyTree  # at the end of the step
     filter: PyTree[Inexact[Array, "lags ..."]]  # the state of the filter of forces
-    dropped: Inexact[Array, ""]  # 1 if some history was dropped, otherwise 0
+    dropped: Inexact[Array, ""]  # how many times a history was dropped
 
 
 class SymmetricMultistep(AbstractMoveSolver[_Carry]):
@@ -199,8 +199,8 @@ class SymmetricMultistep(AbstractMoveSolver[_Carry]):
         sums = _as_sums(nothing)
         return _Carry(zero, zero, nothing, nothing, sums, nothing, many, zero)
 
-    def undoable(self, carry: _Carry) -> Array:
-        return carry.dropped == 0
+    def undoable(self, start: _Carry, end: _Carry) -> Array:
+        return start.dropped == end.dropped
 
     def moves(self, system: System) -> Moves:
         split = self.split(system)
@@ -276,7 +276,7 @@ class _Step:
         dropped = (known < old.count) & (old.count >= self.table.order)
         new = _Carry(
             *(known + 1, cast_to(h, old.h), *lost, momentum, force, filter),
-            jnp.where(dropped, 1, old.dropped),
+            old.dropped + jnp.where(dropped, 1, 0),
         )
         return _from_sums((q, p1), y), new
 
