@@ -31,7 +31,7 @@ import numpy as np
 import problems
 from _report import command_line, Table
 from _schemes import DIFFRAX, Scheme, SCHEMES
-from _solve import final_state, reference
+from _solve import reference, states
 from _timing import interleaved, timed
 from outside import symbolic
 
@@ -117,9 +117,11 @@ def henon_heiles():
 
 def batched(hamiltonian, t1, method, block=None):
     """`solve(y0, x)`, with `x` the number of steps, or the tolerance."""
-    solver, adaptive = method.scheme.solver, method.adaptive
-    one = lambda y0, x: final_state(
-        hamiltonian, solver, (0.0, t1), y0, x, adaptive=adaptive
+    solver, options = method.scheme.solver, {}
+    if isinstance(solver, dps.AbstractPresymplecticSolver):
+        options["adjoint"] = dps.ReversibleAdjoint()
+    one = lambda y0, x: states(
+        hamiltonian, solver, (0.0, t1), y0, x, adaptive=method.adaptive, **options
     )
     if block is None:
         return jax.jit(jax.vmap(one, in_axes=(0, None)))
@@ -192,6 +194,7 @@ def scaling(batch, methods, sizes, repeats, longest):
     errors = Errors(batch, min(max(sizes), CHECKED))
     tuned = tune_all(batch, methods, errors)
     print("\nMicroseconds per trajectory, and error")
+    on_cpu = jax.default_backend() == "cpu"
     for target in TARGETS:
         heads = [f"batch of {n}:>15" for n in sizes]
         table = Table("", f"error {target:.0e}:<24", *heads, "per second:>10.0f")
@@ -203,7 +206,8 @@ def scaling(batch, methods, sizes, repeats, longest):
             short, long = {}, {}
             for method in methods:
                 solve, x = tuned[method.name, target]
-                expected = last[method.name] * n
+                # On a GPU larger batches take as long, until it is full.
+                expected = last[method.name] * (n if on_cpu else min(n, 64))
                 if x is not None and expected < longest:
                     # One run is enough where noise has time to average out.
                     group = short if expected < 1 else long
@@ -214,7 +218,8 @@ def scaling(batch, methods, sizes, repeats, longest):
                 last[name] = each if n >= 64 else 0.0
                 rates[name] = max(rates[name] or 0.0, 1 / each)
                 error = errors.of(timing.result)
-                cells[name].append(f"{each * 1e6:.1f} {error:.0e}")
+                us = each * 1e6
+                cells[name].append(f"{us:.{1 if us >= 1 else 3}f} {error:.0e}")
             for name in cells.keys() - found.keys():
                 cells[name].append(None)
         for name, row in cells.items():

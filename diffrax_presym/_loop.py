@@ -19,7 +19,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
 from ._misc import cast_to
-from ._scan import equations
+from ._scan import equations, repeat
 from ._solver._engine import Span
 from ._system import System
 
@@ -72,6 +72,16 @@ class Steps:
         n = self._after((ts - self.t0) / self._span * self.steps, ts) - 1
         return jnp.clip(n, 0, last)
 
+    def at(self, n: Array, ts: Array) -> Array:
+        """Whether times are the start of step `n`, to rounding.
+
+        Equally spaced times may be computed in another order, and rounded otherwise.
+        """
+        start, largest = self.time(n), jnp.maximum(jnp.abs(self.t0), jnp.abs(self.t1))
+        rounding = 4 * jnp.finfo(largest.dtype).eps * largest
+        length = jnp.maximum(self.time(n + 1) - start, start - self.time(n - 1))
+        return jnp.abs(ts - start) <= jnp.minimum(rounding, length / 64)
+
     @property
     def _span(self) -> Array:
         # A zero span has no steps.
@@ -99,7 +109,7 @@ class Output:
             # computed: the next one if that starts at this time. Steps that are not
             # made are after all others.
             step = steps.holding(sub.ts)
-            after = jnp.where(steps.time(step + 1) == sub.ts, step + 1, step)
+            after = jnp.where(steps.at(step + 1, sub.ts), step + 1, step)
             made = step < last
             self.held = jnp.where(made, step, last + 1)
             self.start = jnp.where(made, after, last + 1)
@@ -188,7 +198,7 @@ class Plan:
         # There is no step of zero length, which friction that is singular at its start
         # would not allow.
         end = jnp.where(end > begin, end, begin + 1)
-        at_start = t <= begin
+        at_start = self.steps.at(n, t)
         t0, t = system.time(begin), system.time(jnp.where(at_start, end, t))
         shorter = lambda: self.solver.between(system, t0, start, t)
         return lax.cond(at_start, lambda: start[0], shorter)
@@ -207,7 +217,12 @@ class Plan:
         made = output.start <= self.last
         steps = jnp.where(made, output.start, 0)
         ts = jnp.where(made, output.ts, self.steps.t0)
-        return jax.vmap(partial(self.output, i, parameters))(steps, starts, ts)
+        system, fns = parameters
+        between = jax.vmap(partial(self.between, system))
+        # Vectorised, a time that is the end of a step would cost as much as others.
+        ends = jnp.all(self.steps.at(steps, ts))
+        ys = lax.cond(ends, lambda: starts[0], lambda: between(steps, starts, ts))
+        return jax.vmap(lambda t, y: fns[i](t, y, system.args))(ts, ys)
 
     def _evaluates_at_once(self) -> bool:
         """Whether outputs between steps are computed at once after the last step."""
@@ -360,8 +375,8 @@ def _walk(plan: Plan, records: PyTree) -> tuple[Now, PyTree]:
     going = lambda now: not can_fail or (now.result == dfx.RESULTS.successful)
 
     def advance(equal: bool, stop: Array, now: Now) -> Now:
-        more = lambda now: (now.n < stop) & going(now)
-        return lax.while_loop(more, partial(step, equal), now)
+        left = lambda now: stop - now.n
+        return repeat(left, partial(step, equal), now, going if can_fail else None)
 
     is_record = lambda x: isinstance(x, _Stack | _Every)
     flat, structure = jtu.tree_flatten(records, is_leaf=is_record)

@@ -171,6 +171,43 @@ def test_prescribed_steps_and_solver_state():
     check(dps.PresymplecticLeapfrog(), saveat)
 
 
+@pytest.mark.parametrize("large", [0, 10**6], ids=["one by one", "at once"])
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_times_that_are_steps_but_for_rounding(dtype, large, monkeypatch):
+    """They are not computed by shorter steps, which would be as expensive as steps."""
+    monkeypatch.setattr(_loop, "_LARGE", large)
+    n, every, forces = 40, 2, []
+    times = np.linspace(T0, T1, n // every + 1, dtype=dtype)
+    ends = dtype(T0) + dtype(T1 - T0) * (np.arange(n + 1, dtype=dtype) / n)
+    assert not np.isin(times, ends).all()
+
+    def force(t, q, args):
+        jax.debug.callback(lambda: forces.append(1))
+        return -jnp.sin(q)
+
+    @jax.jit
+    def run(ts):
+        saveat = dfx.SaveAt(t0=ts is None, steps=every if ts is None else 0, ts=ts)
+        return dfx.diffeqsolve(
+            dps.HamiltonianTerm(dps.VectorField(lambda t, p, args: p, force)),
+            dps.PresymplecticYoshida4("position"),
+            *(dtype(T0), dtype(T1), dtype((T1 - T0) / n)),
+            (jnp.ones(2, dtype), jnp.zeros(2, dtype)),
+            saveat=saveat,
+            adjoint=OURS[1],
+            max_steps=n,
+        ).ys
+
+    at_steps = jax.block_until_ready(run(None))
+    jax.effects_barrier()
+    evaluations = len(forces)
+    at_times = jax.block_until_ready(run(jnp.asarray(times)))
+    jax.effects_barrier()
+    assert evaluations >= 3 * n and len(forces) == 2 * evaluations
+    for a, b in zip(at_times, at_steps, strict=True):
+        np.testing.assert_array_equal(a, b[: len(times)])
+
+
 def test_dense_output():
     check(dps.BlanesMoanRKN4(), dfx.SaveAt(dense=True, t1=True), max_steps=30)
 

@@ -1,5 +1,6 @@
 """The loop over the stages, and the quantities that are hoisted out of it."""
 
+import diffrax as dfx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
@@ -38,7 +39,7 @@ def by(scan, rate, y, reverse=False):
 @pytest.mark.parametrize("reverse", [False, True])
 @pytest.mark.parametrize("n", [2, 40])
 def test_as_a_scan(n, reverse, cpu, monkeypatch):
-    monkeypatch.setattr(_scan, "_is_cpu", lambda: cpu)
+    monkeypatch.setattr(_scan, "cheap_iterations", lambda: cpu)
     y, rate = jnp.linspace(-1.0, 1.0, n), jnp.array(0.3)
     both = [by(scan, rate, y, reverse) for scan in (scan_stages, lax.scan)]
     assert jax.tree.structure(both[0]) == jax.tree.structure(both[1])
@@ -55,7 +56,7 @@ def test_stages_are_written_out_except_on_a_cpu(monkeypatch):
 
     y, loops = jnp.array([0.3]), []
     for cpu in (True, False):
-        monkeypatch.setattr(_scan, "_is_cpu", lambda cpu=cpu: cpu)
+        monkeypatch.setattr(_scan, "cheap_iterations", lambda cpu=cpu: cpu)
         jax.clear_caches()
         found = equations(jax.make_jaxpr(run)(y).eqns)
         scans = [e.params for e in found if e.primitive.name == "scan"]
@@ -65,6 +66,40 @@ def test_stages_are_written_out_except_on_a_cpu(monkeypatch):
     assert rolled == {False} and unrolled == {True}
     for a, b in zip(by_loop, written_out, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-14)
+
+
+@pytest.mark.parametrize("adjoint", [dps.ReversibleAdjoint(), dps.FixedStepAdjoint()])
+def test_steps_are_taken_in_blocks_except_on_a_cpu(adjoint, monkeypatch):
+    """The same solution and gradient, saved at times and every few steps."""
+    monkeypatch.setattr(_scan, "_BLOCK", 8)
+    subs = dfx.SubSaveAt(ts=jnp.array([0.03, 3.1])), dfx.SubSaveAt(steps=17, t1=True)
+
+    def loss(y):
+        sol = solve(
+            HAMILTONIAN,
+            dps.PresymplecticLeapfrog(),
+            *(0.0, 4.0, 0.1, (y, y / 2)),
+            saveat=dfx.SaveAt(subs=subs),
+            adjoint=adjoint,
+            max_steps=40,
+        )
+        times, ends = sol.ys
+        total = sum(jnp.sum(x**2) for x in (*times, *(x[:2] for x in ends)))
+        return total, (sol.ys, sol.stats["num_steps"])
+
+    y, found = jnp.array([0.3]), []
+    for cpu in (True, False):
+        monkeypatch.setattr(_scan, "cheap_iterations", lambda cpu=cpu: cpu)
+        jax.clear_caches()
+        traced = jax.jit(jax.value_and_grad(loss, has_aux=True)).trace(y)
+        eqns = equations(traced.jaxpr.eqns)
+        scans = [e.params for e in eqns if e.primitive.name == "scan"]
+        blocks = [x for x in scans if x["length"] == _scan._BLOCK]
+        # Forwards and backwards.
+        assert not blocks if cpu else len(blocks) >= 2
+        found.append(traced.lower().compile()(y))
+    for a, b in zip(*map(jax.tree.leaves, found), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-13)
 
 
 @pytest.mark.parametrize(

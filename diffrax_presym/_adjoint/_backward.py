@@ -13,6 +13,7 @@ from jaxtyping import Array, PyTree
 
 from .._loop import Inputs, Plan, Trace
 from .._misc import tree_sum
+from .._scan import repeat
 from .._solver._engine import Span, undo, vjp, vjp_step
 
 
@@ -106,7 +107,7 @@ class Backward:
 
         def steps(at: Position, stop: Array) -> Position:
             back = lambda at: self.step(at, start(at.n - 1))
-            return lax.while_loop(lambda at: at.n > stop, back, at)
+            return repeat(lambda at: at.n - stop, back, at)
 
         if not self.saved:
             return steps(at, first)
