@@ -85,8 +85,7 @@ def time_per_step(sizes, steps, repeats):
         *(f"{n}:>9.1f" for n in sizes),
         "compile:>9.1f",
     )
-    for name, *variant in variants():
-        solver, adjoint, cpu = variant
+    for name, solver, adjoint, cpu in variants():
         fn = lambda y0, s=solver, a=adjoint: solution(s, steps, y0, a).ys
         row, first = [], None
         for n in sizes:

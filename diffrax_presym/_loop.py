@@ -372,11 +372,12 @@ def _walk(plan: Plan, records: PyTree) -> tuple[Now, PyTree]:
     can_fail = eqx.filter_eval_shape(partial(step, False), now).result is not None
     if can_fail:
         now = now._replace(result=jtu.tree_map(jnp.asarray, dfx.RESULTS.successful))
-    going = lambda now: not can_fail or (now.result == dfx.RESULTS.successful)
+    well = lambda now: now.result == dfx.RESULTS.successful
+    going = lambda now: not can_fail or well(now)
 
     def advance(equal: bool, stop: Array, now: Now) -> Now:
         left = lambda now: stop - now.n
-        return repeat(left, partial(step, equal), now, going if can_fail else None)
+        return repeat(left, partial(step, equal), now, well if can_fail else None)
 
     is_record = lambda x: isinstance(x, _Stack | _Every)
     flat, structure = jtu.tree_flatten(records, is_leaf=is_record)

@@ -1,5 +1,7 @@
 """The loop over the stages, and the quantities that are hoisted out of it."""
 
+from typing import Any
+
 import diffrax as dfx
 import jax
 import jax.lax as lax
@@ -75,7 +77,7 @@ def test_steps_are_taken_in_blocks_except_on_a_cpu(adjoint, monkeypatch):
     subs = dfx.SubSaveAt(ts=jnp.array([0.03, 3.1])), dfx.SubSaveAt(steps=17, t1=True)
 
     def loss(y):
-        sol = solve(
+        sol: Any = solve(
             HAMILTONIAN,
             dps.PresymplecticLeapfrog(),
             *(0.0, 4.0, 0.1, (y, y / 2)),
