@@ -50,11 +50,14 @@ def last(sol) -> Any:
     return jax.tree.map(lambda y: y[-1], sol.ys)
 
 
-def states(system, solver, times, y0, x, args=None, *, adaptive=False, **options):
+def states(
+    term, solver, times, y0, x, args=None, *, adaptive=False, density=None, **options
+):
     """What is saved in `x` equal steps, or in adaptive ones with tolerance `x`: by
     default the final state.
 
-    It is not a number where the solve failed.
+    With a step density the steps vary, and the first is one of `x` equal ones. The
+    result is not a number where the solve failed.
     """
     t0, t1 = times
     if adaptive:
@@ -62,7 +65,11 @@ def states(system, solver, times, y0, x, args=None, *, adaptive=False, **options
         # A motion that escapes would never end.
         options["max_steps"] = 10**5
     dt0 = None if adaptive else (t1 - t0) / x
-    sol = solve(system, solver, t0, t1, dt0, y0, args, **options)
+    if density is not None:
+        epsilon, dt0 = dt0 / density(t0, y0, args), None
+        options["controller"] = dps.StepDensityController(term, epsilon, density)
+        options["max_steps"] = 10**5
+    sol = solve(term, solver, t0, t1, dt0, y0, args, **options)
     good = sol.result == dfx.RESULTS.successful
     ys = sol.ys if "saveat" in options else last(sol)
     return jax.tree.map(lambda y: jnp.where(good, y, jnp.nan), ys)

@@ -30,6 +30,8 @@ class Problem:
     # About the shortest period over six, in which sweeps of steps and the steps of the
     # reference solution are measured.
     unit: float = 1.0
+    # The distances of bodies that attract each other by the inverse square law.
+    distances: Callable | None = None
 
     @property
     def y0(self):
@@ -119,6 +121,7 @@ def kepler():
         np.array([1 - e, 0.0]),
         np.array([0.0, math.sqrt((1 + e) / (1 - e))]),
         20 * math.pi,
+        distances=lambda q: jnp.sqrt(jnp.sum(q**2)),
     )
 
 

@@ -24,11 +24,14 @@ def pleiades():
     weights = mass[i] * mass[j]
 
     def potential(t, q, args):
-        d = q[:, i] - q[:, j]
-        return -jnp.sum(weights / jnp.sqrt(jnp.sum(d**2, axis=0)))
+        return -jnp.sum(weights / distances(q))
+
+    def distances(q):
+        return jnp.sqrt(jnp.sum((q[:, i] - q[:, j]) ** 2, axis=0))
 
     hamiltonian = conformal(potential, None, dps.QuadraticKinetic(mass[None]))
-    return unforced("Pleiades", hamiltonian, [x, y], mass * np.array([u, v]), 3.0)
+    momenta = mass * np.array([u, v])
+    return unforced("Pleiades", hamiltonian, [x, y], momenta, 3.0, distances=distances)
 
 
 def detest_orbit():
@@ -40,6 +43,7 @@ def detest_orbit():
         [1 - e, 0.0],
         [0.0, np.sqrt((1 + e) / (1 - e))],
         20.0,
+        distances=lambda q: jnp.sqrt(jnp.sum(q**2)),
     )
 
 
@@ -50,12 +54,14 @@ def figure_eight():
     i, j = np.triu_indices(3, 1)
 
     def potential(t, q, args):
-        d = q[:, i] - q[:, j]
-        return -jnp.sum(1 / jnp.sqrt(jnp.sum(d**2, axis=0)))
+        return -jnp.sum(1 / distances(q))
+
+    def distances(q):
+        return jnp.sqrt(jnp.sum((q[:, i] - q[:, j]) ** 2, axis=0))
 
     p0 = np.stack([-v0 / 2, -v0 / 2, v0], axis=1)
-    period = 6.32591398
-    return unforced("figure eight", conformal(potential, None), q0, p0, 5 * period)
+    t1, options = 5 * 6.32591398, {"distances": distances}
+    return unforced("figure eight", conformal(potential, None), q0, p0, t1, **options)
 
 
 def logarithmic_galaxy():

@@ -78,8 +78,10 @@ def planets():
     weights = gravity * mass[i] * mass[j]
 
     def potential(t, q, args):
-        d = q[:, i] - q[:, j]
-        return -jnp.sum(weights / jnp.sqrt(jnp.sum(d**2, axis=0)))
+        return -jnp.sum(weights / distances(q))
+
+    def distances(q):
+        return jnp.sqrt(jnp.sum((q[:, i] - q[:, j]) ** 2, axis=0))
 
     kinetic = dps.QuadraticKinetic(mass[None])
     hamiltonian = conformal(potential, dps.ConstantDamping(1e-6), kinetic)
@@ -90,6 +92,7 @@ def planets():
         (mass[:, None] * v0).T,
         73000.0,
         unit=600.0,
+        distances=distances,
     )
 
 
