@@ -34,7 +34,7 @@ import problems_test
 import problems_tuning
 from _plot import error_against_time, FOLDER
 from _report import command_line, Table
-from _schemes import DIFFRAX, SCHEMES
+from _schemes import DIFFRAX, Scheme, SCHEMES
 from _solve import relative_error, states
 from _timing import error_curves, time_to
 from outside import heyoka_runs, pyhamsys_runs, scipy_runs, STEPS, symplecta_runs
@@ -61,8 +61,18 @@ OURS = [
     "SymmetricMultistep(10)",
     "SymmetricMultistep(12)",
 ]
-# For energies that are not separable.
-OTHERS = ["PresymplecticCoupled(4)", "PresymplecticCoupled(6)", "PresymplecticGauss(6)"]
+# For energies that are not separable; Gauss to rounding, and to two tolerances.
+OTHERS = {
+    name: SCHEMES[name]
+    for name in ("PresymplecticCoupled(4)", "PresymplecticCoupled(6)")
+}
+OTHERS |= {
+    f"PresymplecticGauss({n}), {name}": Scheme(
+        dps.PresymplecticGauss(n, tolerance=tolerance), 2 * n, 7 * n
+    )
+    for n in (2, 4, 6, 8)
+    for name, tolerance in {"rounding": 0.0, "1e-6": 1e-6, "1e-9": 1e-9}.items()
+}
 # With steps that vary by a density, where bodies attract each other.
 VARIABLE = ["BlanesMoanRKN4", "BlanesMoanRKN6", "BlanesCasasRKN8"]
 SETS = {
@@ -144,8 +154,8 @@ def all_runs(problem, quick, ts=None):
     run_of = lambda *args, **options: solver_of(problem, *args, ts=ts, **options)
     runs = {}
     separable = problem.hamiltonian.splits != ()
-    for name in OURS if separable else OTHERS:
-        solver, _, evaluations = SCHEMES[name]
+    ours = {name: SCHEMES[name] for name in OURS} if separable else OTHERS
+    for name, (solver, _, evaluations) in ours.items():
         if (problem.linear or "Linear" not in name) and accepts(solver, problem, term):
             sweep = step_counts(problem, evaluations, quick, ts is not None)
             runs["ours", name] = run_of(term, solver), sweep
@@ -274,7 +284,7 @@ def main():
         results[name] = curves
         print(f"{name}: measured in {taken:.0f} s", flush=True)
     tables(results)
-    if options.set == "seven" and not options.saved:
+    if options.set == "seven" and not (options.saved or options.only):
         picture(results, options.output / "work_precision.png")
 
 
