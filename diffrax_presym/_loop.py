@@ -77,8 +77,9 @@ class Steps:
 
         Equally spaced times may be computed in another order, and rounded otherwise.
         """
-        start, largest = self.time(n), jnp.maximum(jnp.abs(self.t0), jnp.abs(self.t1))
-        rounding = 4 * jnp.finfo(largest.dtype).eps * largest
+        start = self.time(n)
+        largest = jnp.maximum(jnp.abs(self.t0), jnp.abs(start))
+        rounding = 4 * jnp.finfo(start.dtype).eps * largest
         length = jnp.maximum(self.time(n + 1) - start, start - self.time(n - 1))
         return jnp.abs(ts - start) <= jnp.minimum(rounding, length / 64)
 

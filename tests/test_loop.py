@@ -208,6 +208,26 @@ def test_times_that_are_steps_but_for_rounding(dtype, large, monkeypatch):
         np.testing.assert_array_equal(a, b[: len(times)])
 
 
+@pytest.mark.parametrize("large", [0, 10**6], ids=["one by one", "at once"])
+def test_times_close_to_steps_are_not_these_steps(large, monkeypatch):
+    """Rounding is that of the time itself, also if steps are of very unequal size."""
+    monkeypatch.setattr(_loop, "_LARGE", large)
+    grid = np.concatenate([[0.0], np.geomspace(1e-4, 1e3, 15)])
+    grid, ts = np.float32(grid), np.float32(grid[1:-1] * (1 + 1e-4))
+    # Uniform motion, of which every scheme is exact.
+    uniform = dps.VectorField(lambda t, p, args: p, lambda t, q, args: 0 * q)
+    sol: Any = dfx.diffeqsolve(
+        dps.HamiltonianTerm(uniform),
+        dps.PresymplecticLeapfrog(),
+        *(grid[0], grid[-1], None),
+        (jnp.zeros(1, "float32"), jnp.ones(1, "float32")),
+        stepsize_controller=dfx.StepTo(jnp.asarray(grid)),
+        saveat=dfx.SaveAt(ts=jnp.asarray(ts)),
+        adjoint=OURS[1],
+    )
+    np.testing.assert_allclose(sol.ys[0][:, 0], ts, rtol=1e-6)
+
+
 def test_dense_output():
     check(dps.BlanesMoanRKN4(), dfx.SaveAt(dense=True, t1=True), max_steps=30)
 
