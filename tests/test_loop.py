@@ -213,7 +213,8 @@ def test_times_close_to_steps_are_not_these_steps(large, monkeypatch):
     """Rounding is that of the time itself, also if steps are of very unequal size."""
     monkeypatch.setattr(_loop, "_LARGE", large)
     grid = np.concatenate([[0.0], np.geomspace(1e-4, 1e3, 15)])
-    grid, ts = np.float32(grid), np.float32(grid[1:-1] * (1 + 1e-4))
+    ts = np.asarray(grid[1:-1] * (1 + 1e-4), np.float32)
+    grid = np.asarray(grid, np.float32)
     # Uniform motion, of which every scheme is exact.
     uniform = dps.VectorField(lambda t, p, args: p, lambda t, q, args: 0 * q)
     sol: Any = dfx.diffeqsolve(
