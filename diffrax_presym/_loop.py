@@ -2,8 +2,9 @@
 
 Diffrax's loop asks after each step whether something is to be saved in it. Here the
 steps, and those in which the saved times fall, are known, so that the loop runs from
-one to the next without asking. Between steps the solution is a shorter step of the
-scheme itself, of the full order, computed for all saved times at once.
+one to the next without asking. Between steps the solution is the continuous extension
+of the scheme, or else a shorter step of it, of the full order in both cases, computed
+for all saved times at once.
 """
 
 from collections.abc import Callable
@@ -21,12 +22,16 @@ from jaxtyping import Array, PyTree
 from ._misc import cast_to
 from ._scan import equations, repeat
 from ._solver._engine import Span
+from ._solver._extension import Segment
+from ._split import State
 from ._system import System
 
 
 # Numbers in a state from which the outputs between steps are computed one by one,
 # rather than all at once, which would take more memory than it saves time.
 _LARGE = 512
+# Saved times at which a continuous extension is evaluated at once.
+_BLOCK = 4
 
 
 class Steps:
@@ -104,16 +109,26 @@ class Output:
         self.t1 = sub.t1 and sub.steps != 1
         self.ts: Array = jnp.zeros(0) if sub.ts is None else sub.ts
         self.held = self.start = jnp.zeros(0, int)
+        self.inside, self.before = jnp.zeros(0, bool), self.start
+        self.after = self.start
         self.empty = steps.total == 0
         if sub.ts is not None:
             # The step that each time is in, and the one from whose start it is
             # computed: the next one if that starts at this time. Steps that are not
             # made are after all others.
             step = steps.holding(sub.ts)
-            after = jnp.where(steps.at(step + 1, sub.ts), step + 1, step)
+            ends = steps.at(step + 1, sub.ts)
             made = step < last
             self.held = jnp.where(made, step, last + 1)
-            self.start = jnp.where(made, after, last + 1)
+            self.start = jnp.where(made, jnp.where(ends, step + 1, step), last + 1)
+            # Whether it differs from the state at that start.
+            self.inside = made & ~ends & ~steps.at(step, sub.ts)
+            # The numbers of times that are computed from earlier steps, and of those
+            # that are not from later ones.
+            self.before, self.after = (
+                jnp.searchsorted(self.start, self.start, side=side).astype(int)
+                for side in ("left", "right")
+            )
 
     def times(self, n: Array) -> Array:
         """The number of times of `ts` saved in the first `n` steps."""
@@ -175,7 +190,15 @@ class Plan:
             Output(sub, fn, self.steps, self.last)
             for sub, fn in zip(subs, fns, strict=True)
         ]
-        self.at_once = self._evaluates_at_once()
+        timed = any(len(output.held) for output in self.outputs)
+        callbacks = self._callbacks() if timed else []
+        # A callback may not support many times at once.
+        self.extension = None
+        if all(x["vmap_method"] is not None for x in callbacks):
+            self.extension = self.solver.extension(self.system, self.start[0])
+        small = sum(jnp.size(x) for x in jtu.tree_leaves(self.start)) <= _LARGE
+        # Whether outputs between steps are computed at once after the last step.
+        self.at_once = timed and small and not callbacks and self.extension is None
 
     @property
     def length(self) -> Array:
@@ -204,6 +227,16 @@ class Plan:
         shorter = lambda: self.solver.between(system, t0, start, t)
         return lax.cond(at_start, lambda: start[0], shorter)
 
+    def extended(
+        self, system: System, n: Array, segment: Segment, y: State, t: Array, inside
+    ) -> State:
+        """The state at a time, `inside` step `n` or at its start `y`."""
+        assert self.extension is not None
+        # At its start friction may be infinite.
+        t = system.time(jnp.where(inside, t, self.steps.time(n + 1)))
+        at = self.extension.at(system, self.span(n), segment, t)
+        return jtu.tree_map(partial(jnp.where, inside), at, y)
+
     def output(self, i: int, parameters, n: Array, start: PyTree, t: Array) -> PyTree:
         """What is saved at a time in step `n`."""
         system, fns = parameters
@@ -225,23 +258,19 @@ class Plan:
         ys = lax.cond(ends, lambda: starts[0], lambda: between(steps, starts, ts))
         return jax.vmap(lambda t, y: fns[i](t, y, system.args))(ts, ys)
 
-    def _evaluates_at_once(self) -> bool:
-        """Whether outputs between steps are computed at once after the last step."""
-        timed = [i for i, output in enumerate(self.outputs) if len(output.held)]
-        size = sum(jnp.size(x) for x in jtu.tree_leaves(self.start))
-        if not timed or size > _LARGE:
-            return False
-        given = self.system, [output.fn for output in self.outputs]
-        arrays, static = eqx.partition((given, self.start), eqx.is_array)
+    def _callbacks(self) -> list[dict[str, Any]]:
+        """The calls of functions on the host in a step, and in what is saved."""
+        fns = [output.fn for output in self.outputs if len(output.held)]
+        arrays, static = eqx.partition((self.system, fns, self.start), eqx.is_array)
 
         def save(arrays):
-            given, start = eqx.combine(arrays, static)
-            at = jnp.asarray(0), start, self.steps.t1
-            return eqx.filter([self.output(i, given, *at) for i in timed], eqx.is_array)
+            system, fns, start = eqx.combine(arrays, static)
+            y, *_ = self.solver.advance(system, *self.span(jnp.asarray(0)), *start)
+            values = [fn(self.steps.t1, y, system.args) for fn in fns]
+            return eqx.filter(values, eqx.is_array)
 
-        # A callback may not support many times at once.
         called = equations(jax.make_jaxpr(save)(arrays).eqns)
-        return all(eqn.primitive.name != "pure_callback" for eqn in called)
+        return [x.params for x in called if x.primitive.name == "pure_callback"]
 
 
 class Now(NamedTuple):
@@ -262,15 +291,13 @@ class _Stack(NamedTuple):
     init: PyTree
 
     def start(self) -> tuple[PyTree, Array]:
-        number = len(self.steps)
-        stack = lambda x: jnp.broadcast_to(x, (number, *jnp.shape(x)))
-        return jtu.tree_map(stack, self.init), jnp.asarray(0)
+        return _stack(self.init, len(self.steps)), jnp.asarray(0)
 
-    def next(self, now: Now, state, never: Array) -> Array:
+    def next(self, state, never: Array) -> Array:
         _, i = state
         return jnp.where(i < len(self.steps), self.steps[i], never)
 
-    def save(self, now: Now, state, hit):
+    def save(self, now: Now, state, hit, segment: PyTree):
         rows, i = state
         return _set(rows, i, self.value(i, now), hit), i + jnp.where(hit, 1, 0)
 
@@ -283,16 +310,70 @@ class _Every(NamedTuple):
     args: PyTree
     rows: PyTree
 
-    def start(self) -> PyTree:
-        return self.rows
+    def start(self) -> tuple[PyTree, Array]:
+        return self.rows, jnp.asarray(1)
 
-    def next(self, now: Now, state, never: Array) -> Array:
-        every = self.output.every
-        return (now.n // every + 1) * every
+    def next(self, state, never: Array) -> Array:
+        _, k = state
+        return k * self.output.every
 
-    def save(self, now: Now, state, hit):
+    def save(self, now: Now, state, hit, segment: PyTree):
+        rows, k = state
         value = self.output.fn(self.time(now.n), now.state[0], self.args)
-        return _set(state, self.output.row_of_step(now.n), value, hit)
+        rows = _set(rows, self.output.row_of_step(now.n), value, hit)
+        return rows, k + jnp.where(hit, 1, 0)
+
+
+class _Extended(NamedTuple):
+    """What is saved at times in steps, by the continuous extension of these."""
+
+    plan: Plan
+    output: Output
+    init: PyTree
+
+    @property
+    def times(self) -> tuple[Array, Array]:
+        """The times and whether they are in steps, in full blocks from any time on."""
+        last = lambda x: jnp.broadcast_to(x[-1:], _BLOCK - 1)
+        full = lambda x: jnp.concatenate([x, last(x)])
+        return full(self.output.ts), full(self.output.inside)
+
+    def start(self) -> tuple[PyTree, Array]:
+        return _stack(self.init, len(self.output.ts) + _BLOCK - 1), jnp.asarray(0)
+
+    def next(self, state, never: Array) -> Array:
+        _, i = state
+        return jnp.where(i < len(self.output.start), self.output.start[i], never)
+
+    def inside(self, state) -> Array:
+        """Whether the next step has times that are not its start."""
+        _, i = state
+        return self.output.inside[self.output.after[i] - 1]
+
+    def save(self, now: Now, state, hit, segment: PyTree):
+        plan, output, (rows, i) = self.plan, self.output, state
+        system, (y, _) = plan.system, now.state
+        after = jnp.where(hit, output.after[i], i)
+        inside = hit & self.inside(state)
+
+        def value(t: Array, inside: Array) -> PyTree:
+            at = plan.extended(system, now.n, segment, y, t, inside)
+            return output.fn(t, at, system.args)
+
+        def block(x):
+            j, rows = x
+            part = lambda x: lax.dynamic_slice_in_dim(x, j, _BLOCK)
+            new = jax.vmap(value)(*map(part, self.times))
+            put = partial(lax.dynamic_update_slice_in_dim, start_index=j, axis=0)
+            return j + _BLOCK, jtu.tree_map(put, rows, new)
+
+        def same(j: Array, rows: PyTree) -> PyTree:
+            return _set(rows, j, output.fn(output.ts[j], y, system.args), True)
+
+        # Loops of no iterations, since a branch would copy all rows.
+        more = lambda x: inside & (x[0] < after)
+        j, rows = lax.while_loop(more, block, (i, rows))
+        return lax.fori_loop(j, after, same, rows), after
 
 
 class Trace(NamedTuple):
@@ -320,7 +401,9 @@ def run(inputs: Inputs, keep: Callable[[Plan], Array] | None = None):
         first = partial(output.fn, plan.steps.t0, plan.start[0], args)
         rows.append(_set(save.ys, 0, first(), True) if output.first else save.ys)
         stack = None
-        if len(output.held) and plan.at_once:
+        if len(output.held) and plan.extension is not None:
+            stack = _Extended(plan, output, first())
+        elif len(output.held) and plan.at_once:
             stack = _Stack(output.start, of_state, plan.start)
         elif len(output.held):
             value = lambda j, now, i=i, output=output: plan.output(
@@ -339,11 +422,13 @@ def run(inputs: Inputs, keep: Callable[[Plan], Array] | None = None):
 
     states = []
     for i, (output, save) in enumerate(zip(plan.outputs, saves, strict=True)):
-        ys, values = rows[i] if every[i] is None else saved[i], None
+        ys, values = rows[i] if every[i] is None else saved[i][0], None
         if plan.at_once and stacked[i] is not None:
             values = plan.all_outputs(i, inputs.parameters, starts[i])
         elif stacked[i] is not None:
-            values, _ = stacked[i]
+            # There may be rows that complete a block.
+            number = len(output.held)
+            values = jtu.tree_map(lambda x, n=number: x[:n], stacked[i][0])
         final = partial(output.fn, plan.steps.time(now.n), now.state[0], args)
         states.append(_assemble(plan, output, save, now, ys, values, final))
     return _final_state(plan, now, plan.structure.unflatten(states)), trace
@@ -354,19 +439,30 @@ def _walk(plan: Plan, records: PyTree) -> tuple[Now, PyTree]:
     steps, solver, system = plan.steps, plan.solver, plan.system
     init, meter = plan.rest["init_state"], plan.rest["progress_meter"]
 
-    def step(equal: bool, now: Now) -> Now:
+    def extended(equal: bool, now: Now, extend: bool = True) -> tuple[Now, PyTree]:
+        """A step, and its continuous extension."""
         span = plan.span(now.n)
         if equal:
             # What depends on the length alone is computed before the loop.
             span = span._replace(h=plan.length)
         fitted = solver.fitted(system, span.t1, span.h, now.state[0])
-        y, carry, result = solver.attempt(fitted, *span, *now.state)
-        end, infos = (y, carry), now.dense
+        extension, infos, segment = plan.extension, now.dense, None
+        if extension is None or not extend:
+            y, carry, result = solver.attempt(fitted, *span, *now.state)
+        else:
+            args = extension, fitted, span, *now.state
+            y, carry, result, forces = solver.recorded(*args)
+            segment = extension.segment(system, span, now.state[0], forces)
+        end = y, carry
         if infos is not None:
-            info = solver.dense_info(system, *span, now.state, end)
+            info = solver.dense_info(system, span, now.state, end)
             infos = _set(infos, now.n, info, True)
         done = (steps.time(now.n + 1) - steps.t0) / (steps.t1 - steps.t0)
-        return Now(now.n + 1, end, result, meter.step(now.meter, done), infos)
+        now = Now(now.n + 1, end, result, meter.step(now.meter, done), infos)
+        return now, segment
+
+    def step(equal: bool, now: Now) -> Now:
+        return extended(equal, now, extend=False)[0]
 
     zero, meters = jnp.asarray(0), init.progress_meter_state
     now = Now(zero, plan.start, None, meters, init.dense_infos)
@@ -380,32 +476,43 @@ def _walk(plan: Plan, records: PyTree) -> tuple[Now, PyTree]:
         left = lambda now: stop - now.n
         return repeat(left, partial(step, equal), now, well if can_fail else None)
 
-    is_record = lambda x: isinstance(x, _Stack | _Every)
+    is_record = lambda x: isinstance(x, _Stack | _Every | _Extended)
     flat, structure = jtu.tree_flatten(records, is_leaf=is_record)
     states = [record.start() for record in flat]
     # The loop stops for nothing else, so that each stop is one of the record's.
     alone = len(flat) == 1 and not can_fail
     each = alone and isinstance(flat[0], _Every) and flat[0].output.every == 1
 
-    def due(now: Now, states) -> list[Array]:
+    def due(states) -> list[Array]:
         never = plan.last + 1
         pairs = zip(flat, states, strict=True)
-        return [record.next(now, state, never) for record, state in pairs]
+        return [record.next(state, never) for record, state in pairs]
 
     def stop(equal: bool, x):
         now, states = x
-        wanted = due(now, states)
+        wanted = due(states)
         at = reduce(jnp.minimum, wanted)
         now = step(equal, now) if each else advance(equal, at, now)
-        new = [
-            record.save(now, state, alone or (w == at) & (now.n == at))
-            for record, state, w in zip(flat, states, wanted, strict=True)
+        hits = [alone or (w == at) & (now.n == at) for w in wanted]
+        new, segment, triples = now, None, list(zip(flat, states, hits, strict=True))
+        inside = [
+            hit & record.inside(state)
+            for record, state, hit in triples
+            if isinstance(record, _Extended)
         ]
-        return now, new
+        if inside and plan.extension is not None:
+            take = partial(extended, equal)
+            zeros = lambda x: jnp.zeros(x.shape, x.dtype)
+            none = jtu.tree_map(zeros, eqx.filter_eval_shape(take, now)[1])
+            leave = lambda now: (now, none)
+            new, segment = lax.cond(reduce(jnp.logical_or, inside), take, leave, now)
+        # What is saved is that at the start of this step.
+        saved = [record.save(now, *rest, segment) for record, *rest in triples]
+        return new, saved
 
     def more(last: Array, x):
         now, states = x
-        return (reduce(jnp.minimum, due(now, states)) <= last) & going(now)
+        return (reduce(jnp.minimum, due(states)) <= last) & going(now)
 
     def run(equal: bool, last: Array, now: Now, states):
         if flat:
@@ -477,6 +584,12 @@ def _final_state(plan: Plan, now: Now, save_state):
         get = lambda state: (state.dense_ts, state.dense_infos, state.dense_save_index)
         state = eqx.tree_at(get, state, (ts, now.dense, n))
     return state
+
+
+def _stack(value: PyTree, number: int) -> PyTree:
+    """Rows of one value."""
+    stack = lambda x: jnp.broadcast_to(x, (number, *jnp.shape(x)))
+    return jtu.tree_map(stack, value)
 
 
 def _set(rows: PyTree, i: Array | int, value: PyTree, hit) -> PyTree:

@@ -14,6 +14,7 @@ from helpers import assert_close
 import diffrax_presym as dps
 from diffrax_presym import _loop
 from diffrax_presym._scan import equations
+from diffrax_presym._solver import _splitting
 
 
 DIFFRAX = dfx.RecursiveCheckpointAdjoint()
@@ -105,12 +106,16 @@ def test_whatever_is_saved(seed, monkeypatch):
     subs = [random_sub(rng, t0, t1) for _ in range(rng.integers(1, 3))]
     saveat = dfx.SaveAt(subs=subs[0] if len(subs) == 1 else subs)
     max_steps = int(rng.choice([23, 64]))
-    if rng.integers(2):
-        # As for large states, whose outputs between steps are computed one by one.
-        monkeypatch.setattr(_loop, "_LARGE", 0)
+    # As for large states, whose outputs between steps are computed one by one, and by
+    # the continuous extension.
+    place = rng.integers(3)
+    if place:
+        monkeypatch.setattr(
+            *[(), (_loop, "_LARGE", 0), (_splitting, "_MANY", 0)][place]
+        )
     # Steps so short that interpolation is almost right to rounding.
     kwargs = dict(t0=t0, t1=t1, dt0=dt0, max_steps=max_steps, throw=False)
-    check(dps.BlanesMoanRKN6(), saveat, 1e-10, **kwargs)
+    check(dps.BlanesMoanRKN6(), saveat, 1e-9 if place == 2 else 1e-10, **kwargs)
     jax.clear_caches()
 
 
@@ -295,8 +300,15 @@ def reference():
     ],
     ids=lambda x: type(x).__name__,
 )
-@pytest.mark.parametrize("adjoint", [DIFFRAX, OURS[0]], ids=["diffrax", "ours"])
-def test_the_error_between_steps_is_that_at_steps(solver, dt0, adjoint, reference):
+@pytest.mark.parametrize("loop", ["diffrax", "ours", "extension"])
+def test_the_error_between_steps_is_that_at_steps(
+    solver, dt0, loop, reference, monkeypatch
+):
+    if loop == "extension":
+        monkeypatch.setattr(_splitting, "_MANY", 0)
+        if not isinstance(solver, _splitting.AbstractSplitting):
+            pytest.skip("no extension")
+    adjoint = DIFFRAX if loop == "diffrax" else OURS[0]
     at_steps, anywhere = errors_of(adjoint, solver, dt0, reference)
     assert 1e-12 < anywhere < 3 * at_steps
 

@@ -31,8 +31,11 @@ class _Saved(NamedTuple):
     """Outputs of one kind, in the order of time."""
 
     number: Array
-    step: Callable[[Array], Array]  # the step at whose start each is computed
+    step: Callable[[Array], Array]  # the step from whose start each is computed
+    # Pulls back one of them, or all up to it that are computed from the same step.
     pull: Callable[[Position, Array], tuple[PyTree, PyTree]]
+    # The number of those that are left then.
+    before: Callable[[Array], Array]
 
 
 class Backward:
@@ -73,8 +76,11 @@ class Backward:
             if output.every:
                 self.saved.append(self._every(i))
             if len(output.held):
-                starts = self.trace.starts[i]
+                starts, before = self.trace.starts[i], lambda j: j
                 pull = partial(self._pull_time, i)
+                if plan.extension is not None:
+                    pull = partial(self._pull_times, i)
+                    before = lambda j, output=output: output.before[j]
                 if starts is not None:
                     more, rows = self._pull_all(i, starts)
                     gradient = tree_sum(gradient, more)
@@ -84,7 +90,7 @@ class Backward:
                     )
                 begin = jnp.where(output.empty, 0, output.start)
                 step = lambda j, begin=begin: begin[j]
-                self.saved.append(_Saved(output.times(n), step, pull))
+                self.saved.append(_Saved(output.times(n), step, pull, before))
         return Position(n, state, bar, gradient, [x.number for x in self.saved])
 
     def start(self, at: Position) -> Position:
@@ -125,7 +131,7 @@ class Backward:
                     at, saved.pull(at, left[k] - 1)
                 )
                 at = lax.cond(hit, pull, lambda at: at, at)
-                left[k] = left[k] - jnp.where(hit, 1, 0)
+                left[k] = jnp.where(hit, saved.before(left[k] - 1), left[k])
                 at = at._replace(left=left)
             return at
 
@@ -159,7 +165,7 @@ class Backward:
             bar = self._row(i, output.row_of_step(step(j)), True)
             return self._pull_state(i, at.n, at.state, bar)
 
-        return _Saved(self.trace.n // output.every, step, pull)
+        return _Saved(self.trace.n // output.every, step, pull, lambda j: j)
 
     def _row(self, i: int, row: Array, pred) -> PyTree:
         """The cotangent of one row of an output, or zero."""
@@ -190,6 +196,46 @@ class Backward:
         bar = self._row(i, plan.outputs[i].rows_of_times()[j], True)
         return jax.vjp(output, self.moved, at.state)[1](bar)
 
+    def _pull_times(self, i: int, at: Position, j: Array):
+        """Pull back all outputs up to one of them that are saved in the same step."""
+        plan, output = self.plan, self.plan.outputs[i]
+        extension, span, rows = plan.extension, plan.span(at.n), output.rows_of_times()
+        assert extension is not None
+
+        def segment(moved, start):
+            system, _ = eqx.combine(moved, self.fixed)
+            *_, forces = self.solver.recorded(extension, system, span, *start)
+            return extension.segment(system, span, start[0], forces)
+
+        def value(k: Array, moved, segment, y):
+            system, fns = eqx.combine(moved, self.fixed)
+            t = output.ts[k]
+            if segment is not None:
+                y = plan.extended(system, at.n, segment, y, t, output.inside[k])
+            return eqx.filter(fns[i](t, y, system.args), eqx.is_inexact_array)
+
+        def all_values(segment):
+            inputs = self.moved, segment, at.state[0]
+
+            def add(k: Array, bars):
+                pull = jax.vjp(partial(value, k), *inputs)[1]
+                return tree_sum(bars, pull(self._row(i, rows[k], True)))
+
+            zeros = jtu.tree_map(jnp.zeros_like, inputs)
+            return lax.fori_loop(output.before[j], j + 1, add, zeros)
+
+        def at_start():
+            more, _, y_bar = all_values(None)
+            return more, (y_bar, jtu.tree_map(jnp.zeros_like, at.state[1]))
+
+        def inside():
+            within, pull = jax.vjp(segment, self.moved, at.state)
+            more, bar, y_bar = all_values(within)
+            gradient, (y, carry) = pull(bar)
+            return tree_sum(more, gradient), (tree_sum(y, y_bar), carry)
+
+        return lax.cond(output.inside[j], inside, at_start)
+
     def _pull_all(self, i: int, starts: PyTree):
         """Pull back all outputs between steps."""
         plan, output = self.plan, self.plan.outputs[i]
@@ -214,7 +260,7 @@ class Backward:
 
         def dense_info(moved, start, end):
             system, _ = eqx.combine(moved, self.fixed)
-            return self.solver.dense_info(system, *span, start, end)
+            return self.solver.dense_info(system, span, start, end)
 
         bar = jtu.tree_map(lambda x: x[n], self.dense)
         pull = jax.vjp(dense_info, self.moved, start, at.state)[1]

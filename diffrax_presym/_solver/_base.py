@@ -28,6 +28,7 @@ from ._engine import (
     time_lengths,
 )
 from ._estimate import no_error_estimate
+from ._extension import Extension
 
 
 if TYPE_CHECKING:
@@ -184,6 +185,36 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         y, carry, result = self.advance(system, t0, t1, h, y, carry)
         return y, carry, first_failure(result, system.check(t1, y))
 
+    def extension(self, system: System, y: State) -> Extension | None:
+        """The continuous extension of the scheme, if there is one."""
+        return None
+
+    # What a wrapper keeps of a scheme is part of its own solver state.
+
+    def inner_carry(self, carry: _Carry) -> PyTree:
+        """The solver state of the scheme within all wrappers."""
+        return carry
+
+    def with_inner_carry(self, carry: _Carry, inner: PyTree) -> _Carry:
+        """The solver state with that of the scheme within all wrappers replaced."""
+        return inner
+
+    def recorded(
+        self,
+        extension: Extension,
+        system: System,
+        span: Span,
+        y: State,
+        carry: _Carry,
+    ) -> tuple[State, _Carry, Result, PyTree]:
+        """As `attempt`, and the forces that the extension needs."""
+        inner = self.inner_carry(carry)
+        start = self.with_inner_carry(carry, extension.record(y, inner))
+        y, end, result = self.attempt(system, *span, y, start)
+        record = self.inner_carry(end)
+        end = self.with_inner_carry(end, None if inner is None else record.last)
+        return y, end, result, extension.forces(record)
+
     def between(
         self, system: System, t0: Array, start: tuple[State, _Carry], t: Array
     ) -> State:
@@ -225,23 +256,21 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         if made_jump is not False and jtu.tree_leaves(carry):
             restart = lambda: self.start(system, t0, y0)
             carry = lax.cond(made_jump, restart, lambda: solver_state)
-        h = self.step_length(t0, t1)
-        y1, new_carry, result = self.attempt(system, t0, t1, h, y0, carry)
-        ends = (y0, carry), (y1, new_carry)
-        dense_info = self.dense_info(system, t0, t1, h, *ends)
+        span = Span(t0, t1, self.step_length(t0, t1))
+        y1, new_carry, result = self.attempt(system, *span, y0, carry)
+        dense_info = self.dense_info(system, span, (y0, carry), (y1, new_carry))
         result = dfx.RESULTS.successful if result is None else result
         return y1, no_error_estimate(y1), dense_info, new_carry, result
 
     def dense_info(
         self,
         system: System,
-        t0: Array,
-        t1: Array,
-        h: Array,
+        span: Span,
         start: tuple[State, _Carry],
         end: tuple[State, _Carry],
     ) -> dict[str, State]:
         """The data for the interpolation of a step, from its two ends."""
+        t0, t1, h = span
         (y0, _), (y1, _) = start, end
         slope0, slope1 = self.slope(system, t0, *start), self.slope(system, t1, *end)
         info = dict(y0=y0, y1=y1, k0=tree_scale(h, slope0), k1=tree_scale(h, slope1))
@@ -314,6 +343,12 @@ class AbstractWrapper(AbstractMoveSolver[_Carry], Generic[_Carry]):
 
     def undoable(self, start: PyTree, end: PyTree) -> Array | None:
         return self.base.undoable(start, end)
+
+    def inner_carry(self, carry: _Carry) -> PyTree:
+        return self.base.inner_carry(carry)
+
+    def with_inner_carry(self, carry: _Carry, inner: PyTree) -> _Carry:
+        return self.base.with_inner_carry(carry, inner)
 
     def composition_error(self) -> str | None:
         return self.base.composition_error() or super().composition_error()

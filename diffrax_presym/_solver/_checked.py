@@ -1,8 +1,10 @@
 from jaxtyping import PyTree
 
+from .._split import State
 from .._system import System
 from ._base import AbstractPresymplecticSolver, AbstractWrapper
 from ._engine import Moves, Stages
+from ._extension import Extension
 from ._moves import check_finite
 
 
@@ -31,6 +33,9 @@ class Checked(AbstractWrapper[PyTree]):
         `ValueError` if it is not one.
         """
         self.base = base
+
+    def extension(self, system: System, y: State) -> Extension | None:
+        return self.base.extension(system, y)
 
     def moves(self, system: System) -> Moves:
         moves = self.base.moves(system), check_finite

@@ -7,6 +7,7 @@ from .._split import State
 from .._system import System
 from ._base import AbstractPresymplecticSolver, AbstractWrapper
 from ._engine import Moves, Stages
+from ._extension import Extension
 from ._moves import to_sums
 
 
@@ -78,6 +79,15 @@ class Compensated(AbstractWrapper[PyTree]):
     def moves(self, system: System) -> Moves:
         moves = to_sums, self.base.moves(system), to_sums.inverse
         return Stages(moves, [(0, 0, 0), (0, 1, 1), (1, 1, 0)])
+
+    def extension(self, system: System, y: State) -> Extension | None:
+        return self.base.extension(system, y)
+
+    def inner_carry(self, carry: PyTree) -> PyTree:
+        return self.base.inner_carry(carry[0])
+
+    def with_inner_carry(self, carry: PyTree, inner: PyTree) -> PyTree:
+        return self.base.with_inner_carry(carry[0], inner), carry[1]
 
     def undoable(self, start: PyTree, end: PyTree) -> Array | None:
         return self.base.undoable(start[0], end[0])

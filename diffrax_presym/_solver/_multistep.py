@@ -220,8 +220,8 @@ class SymmetricMultistep(AbstractMoveSolver[_Carry]):
         h = self.step_length(t0, t)
         return _ONE_STEP.advance(system, t0, t, h, start[0], None)[0]
 
-    def dense_info(self, system: System, t0, t1, h, start, end) -> dict[str, PyTree]:
-        step = _Step(system, self.split(system), self.table, Span(t0, t1, h))
+    def dense_info(self, system: System, span: Span, start, end) -> dict[str, PyTree]:
+        step = _Step(system, self.split(system), self.table, span)
         return step.dense_info(start[0], end[0])
 
 
