@@ -2,9 +2,16 @@
 
 A damped pendulum of large amplitude to t = 20, saved at eight times in each step:
 through Diffrax's own loop, which interpolates, and through that of `ReversibleAdjoint`,
-which takes shorter steps. The error is the largest entry of the difference to a
-solution by `SofroniouSpaletta10` with small steps.
+which takes shorter steps, or for large states (100 copies of the pendulum) uses the
+continuous extension of splittings. The error is the largest entry of the difference to
+a solution by `SofroniouSpaletta10` with small steps.
+
+A second table is the time of solves of `TunedRKN6` that save 201 times: of the solve
+that saves its end alone, and with shorter steps over that with the extension, each in
+pairs of runs.
 """
+
+import functools
 
 import diffrax as dfx
 import jax
@@ -12,8 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from _report import command_line, Table
 from _solve import solve
+from _timing import interleaved
 
 import diffrax_presym as dps
+from diffrax_presym._solver import _splitting
 
 
 jax.config.update("jax_enable_x64", True)
@@ -44,22 +53,27 @@ SCHEMES = {
     "PresymplecticGauss(4)": (dps.PresymplecticGauss(4), (1.0, 0.5)),
     "PresymplecticGauss(8)": (dps.PresymplecticGauss(8), (2.0, 1.0)),
 }
+OURS = dps.ReversibleAdjoint()
 LOOPS = {
-    "Diffrax's": dfx.RecursiveCheckpointAdjoint(),
-    "ours": dps.ReversibleAdjoint(),
+    "Diffrax's": (dfx.RecursiveCheckpointAdjoint(), 1),
+    "ours": (OURS, 1),
+    "extension": (OURS, 100),
 }
 INSIDE = 8
 
 
-def saved(solver, dt0, ts, adjoint):
-    run = lambda: solve(
-        SYSTEM, solver, 0.0, T1, dt0, Y0, saveat=dfx.SaveAt(ts=ts), adjoint=adjoint
-    )
-    return np.concatenate(jax.jit(lambda: run().ys)(), axis=1)
+def run(solver, dt0, saveat, adjoint, copies):
+    y0 = tuple(jnp.repeat(x, copies) for x in Y0)
+    return solve(SYSTEM, solver, 0.0, T1, dt0, y0, saveat=saveat, adjoint=adjoint).ys
 
 
-def main():
-    quick = command_line(__doc__).parse_args().quick
+def saved(solver, dt0, ts, adjoint, copies):
+    saveat = dfx.SaveAt(ts=ts)
+    ys = jax.jit(lambda: run(solver, dt0, saveat, adjoint, copies))()
+    return np.concatenate([y[:, :1] for y in ys], axis=1)
+
+
+def errors(quick):
     table = Table(
         None,
         "scheme:<24",
@@ -70,14 +84,59 @@ def main():
         "ratio:>6.2f",
     )
     for name, (solver, steps) in SCHEMES.items():
+        extended = isinstance(solver, _splitting.AbstractSplitting)
+        extended = extended and not isinstance(solver, dps.TunedLinear8)
         for h in steps[:1] if quick else steps:
             ts = jnp.linspace(0.0, T1, round(T1 / h) * INSIDE + 1)
-            fine = saved(dps.SofroniouSpaletta10(), 0.02, ts, LOOPS["ours"])
-            for loop, adjoint in LOOPS.items():
-                if not quick or loop == "ours":
-                    error = np.abs(saved(solver, h, ts, adjoint) - fine)
+            fine = saved(dps.SofroniouSpaletta10(), 0.02, ts, *LOOPS["ours"])
+            for loop, (adjoint, copies) in LOOPS.items():
+                if loop == "ours" or (not quick and (copies == 1 or extended)):
+                    error = np.abs(saved(solver, h, ts, adjoint, copies) - fine)
                     at, anywhere = np.max(error[::INSIDE]), np.max(error)
                     table.row(name, h, loop, at, anywhere, anywhere / at)
+
+
+def times(quick):
+    table = Table(
+        None,
+        "pendulums:>9d",
+        "steps:>5d",
+        "end alone, us:>13.0f",
+        "201 times, us:>13.0f",
+        "shorter steps over that:>23.1f",
+    )
+    saveats = {"end": dfx.SaveAt(t1=True)}
+    saveats |= dict.fromkeys(
+        ("shorter", "extended"), dfx.SaveAt(ts=jnp.linspace(0, T1, 201))
+    )
+    # Numbers in a state from which the extension is used.
+    usual = _splitting._MANY
+    for copies in (100,) if quick else (100, 1000):
+        for steps in (20, 50, 100, 200):
+            calls = {}
+            for name, saveat in saveats.items():
+                _splitting._MANY = 10**9 if name == "shorter" else usual
+                args = dps.TunedRKN6(), T1 / steps, saveat, OURS, copies
+                # Solves of equal arguments are traced once.
+                jax.clear_caches()
+                traced = jax.jit(functools.partial(run, *args)).lower()
+                calls[name] = traced.compile()
+            measured = interleaved(calls, 9 if quick else 31)
+            extended = measured["extended"]
+            table.row(
+                copies,
+                steps,
+                1e6 * measured["end"].median,
+                1e6 * extended.median,
+                measured["shorter"].over(extended),
+            )
+    _splitting._MANY = usual
+
+
+def main():
+    quick = command_line(__doc__).parse_args().quick
+    errors(quick)
+    times(quick)
 
 
 if __name__ == "__main__":
