@@ -360,11 +360,15 @@ class _Extended(NamedTuple):
             at = plan.extended(system, now.n, segment, y, t, inside)
             return output.fn(t, at, system.args)
 
+        times = self.times
+
         def block(x):
             j, rows = x
             part = lambda x: lax.dynamic_slice_in_dim(x, j, _BLOCK)
-            new = jax.vmap(value)(*map(part, self.times))
-            put = partial(lax.dynamic_update_slice_in_dim, start_index=j, axis=0)
+            new = jax.vmap(value)(*map(part, times))
+            put = lambda xs, x: lax.dynamic_update_slice_in_dim(
+                xs, cast_to(x, xs), j, 0
+            )
             return j + _BLOCK, jtu.tree_map(put, rows, new)
 
         def same(j: Array, rows: PyTree) -> PyTree:
