@@ -7,6 +7,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from .._scan import cheap_iterations
 from .._split import AbstractSplit, State
 from .._system import System
 from ._base import AbstractMoveSolver
@@ -121,8 +122,10 @@ class AbstractSplitting(AbstractMoveSolver[PyTree]):
         # Of other systems the drifts are not multiples of the velocity.
         known = system.split("shared") is not None and self.kind != "shared"
         # Shorter steps are faster for few numbers, for all saved times at once, and for
-        # schemes of few kicks.
+        # schemes of few kicks. On a GPU, where a loop over steps costs more than their
+        # evaluations, the extension has not been measured.
         many = sum(jnp.size(x) for x in jtu.tree_leaves(y)) >= _MANY
+        many = many and cheap_iterations()
         kicks = len(self.tableau.fractions[1::2])
         if not (known and many and kicks > number_of_points(self.tableau)):
             return None
