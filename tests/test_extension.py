@@ -64,7 +64,19 @@ SCHEMES = {
 
 @pytest.mark.parametrize(
     "name, law",
-    list(zip(SCHEMES, [*LAWS, "logarithmic", "constant"], strict=True)),
+    [
+        ("BlanesMoan4", "any"),
+        ("TunedRKN6", "logarithmic"),
+        *(
+            pytest.param(name, law, marks=pytest.mark.slow)
+            for name, law in {
+                "BlanesMoanRKN4": "constant",
+                "BlanesMoan6": "logarithmic",
+                "BlanesCasasRKN8": "none",
+                "compensated": "constant",
+            }.items()
+        ),
+    ],
 )
 def test_the_order_is_that_of_the_scheme(name, law):
     solver = SCHEMES[name]
