@@ -223,7 +223,7 @@ def _weights(tableau: SplittingTableau, times: np.ndarray, s: float) -> np.ndarr
     # Large weights would amplify rounding.
     matrix = np.concatenate([*(row * (s - times) for row in rows), np.eye(len(times))])
     wanted.append(np.zeros(len(times)))
-    return np.linalg.lstsq(matrix, np.concatenate(wanted))[0]
+    return np.linalg.lstsq(matrix, np.concatenate(wanted), rcond=None)[0]
 
 
 def _moves(tableau: SplittingTableau) -> list[tuple[str, float]]:
