@@ -189,18 +189,17 @@ def _constants(tableau: SplittingTableau) -> _Constants:
     times = np.cumsum(np.where(is_kick, 0, fractions))[is_kick]
     if tableau.kick_first:
         times[-1] = 1.0
-    weights = [_weights(tableau, times, s) for s in points[1:-1]]
+    weights = _weights(tableau, times, points[1:-1])
     series = np.polynomial.chebyshev
     lagrange = np.linalg.inv(series.chebvander(2 * points - 1, len(points) - 1))
     integrals = series.chebint(lagrange, lbnd=-1, scl=0.5)
     # At the end all Chebyshev polynomials are one.
     lengths = np.sum(integrals, axis=0)
-    weights = np.stack(weights)
     return _Constants(times, fractions[is_kick], points, weights, lengths, integrals)
 
 
-def _weights(tableau: SplittingTableau, times: np.ndarray, s: float) -> np.ndarray:
-    """The weights of kicks that give the position at a fraction of a step.
+def _weights(tableau: SplittingTableau, times: np.ndarray, points) -> np.ndarray:
+    """The weights of kicks that give the positions at fractions of a step.
 
     Least squares over the order conditions and oscillators, each divided by the error
     of the scheme that is to be expected.
@@ -209,21 +208,27 @@ def _weights(tableau: SplittingTableau, times: np.ndarray, s: float) -> np.ndarr
     degrees = np.array([len(w) for w in words])
     sizes = [x ** (degrees + 2) / error for x, error in _TYPICAL]
     scale = np.max(sizes, axis=0)
-    exact = np.array([s ** (k + 2) / math.factorial(k + 2) for k in degrees])
-    rows = [(_expansions(tableau, words) * scale).T]
-    wanted = [exact * scale]
+    factorials = np.array([math.factorial(k + 2) for k in degrees])
+    forces = [(_expansions(tableau, words) * scale).T]
+    exact = [points[:, None] ** (degrees + 2) / factorials * scale]
     for x in _PHASES:
-        forces, end = _oscillate(tableau, x)
-        at = lambda t, x=x: np.array([np.cos(t * x), np.sin(t * x) / x])
+        kicked, end = _oscillate(tableau, x)
+        at = lambda t, x=x: np.stack([np.cos(t * x), np.sin(t * x) / x], axis=-1)
         slope = np.array([-x * np.sin(x), np.cos(x)])
         errors = np.abs(end - np.stack([at(1.0), slope])) / [[1.0], [max(x, 1.0)]]
         scale = 0.3 / math.sqrt(len(_PHASES)) / (np.max(errors) + 1e-13)
-        rows.append(forces.T * scale)
-        wanted.append((at(s) - [1.0, s]) * scale)
+        forces.append(kicked.T * scale)
+        uniform = np.stack([np.ones_like(points), points], axis=-1)
+        exact.append((at(points) - uniform) * scale)
+    matrix, wanted = np.concatenate(forces), np.concatenate(exact, axis=1)
     # Large weights would amplify rounding.
-    matrix = np.concatenate([*(row * (s - times) for row in rows), np.eye(len(times))])
-    wanted.append(np.zeros(len(times)))
-    return np.linalg.lstsq(matrix, np.concatenate(wanted), rcond=None)[0]
+    least, none = np.eye(len(times)), np.zeros(len(times))
+
+    def fit(s: float, wanted: np.ndarray) -> np.ndarray:
+        rows = np.concatenate([matrix * (s - times), least])
+        return np.linalg.lstsq(rows, np.append(wanted, none), rcond=None)[0]
+
+    return np.stack([fit(s, row) for s, row in zip(points, wanted, strict=True)])
 
 
 def _moves(tableau: SplittingTableau) -> list[tuple[str, float]]:
@@ -231,7 +236,6 @@ def _moves(tableau: SplittingTableau) -> list[tuple[str, float]]:
     return list(zip(letters, tableau.fractions, strict=False))
 
 
-@functools.cache
 def _words(degree: int) -> list[str]:
     """The products of at most so many drifts A and kicks B that act on a force.
 
