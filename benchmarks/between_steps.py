@@ -2,16 +2,19 @@
 
 A damped pendulum of large amplitude to t = 20, saved at eight times in each step:
 through Diffrax's own loop, which interpolates, and through that of `ReversibleAdjoint`,
-which takes shorter steps, or for large states (100 copies of the pendulum) uses the
-continuous extension of splittings. The error is the largest entry of the difference to
-a solution by `SofroniouSpaletta10` with small steps.
+which takes shorter steps, or where forces take long (100 copies of the pendulum) uses
+the continuous extension of the scheme. The error is the largest entry of the difference
+to a solution by `SofroniouSpaletta10` with small steps.
 
-A second table is the time of solves of `TunedRKN6` that save 201 times: of the solve
-that saves its end alone, and with shorter steps over that with the extension, each in
-pairs of runs.
+A second table is the time of solves that save 201 times, of pendulums by `TunedRKN6`
+and of chains of rods by `PresymplecticGauss(6, tolerance=1e-9)`: of the solve that
+saves its end alone, and with shorter steps over that with the extension, each in pairs
+of runs.
 """
 
 import functools
+import math
+from typing import NamedTuple
 
 import diffrax as dfx
 import jax
@@ -20,9 +23,10 @@ import numpy as np
 from _report import command_line, Table
 from _solve import solve
 from _timing import interleaved
+from gauss import rods
 
 import diffrax_presym as dps
-from diffrax_presym._solver import _splitting
+from diffrax_presym._solver import _extension, _splitting
 
 
 jax.config.update("jax_enable_x64", True)
@@ -84,7 +88,8 @@ def errors(quick):
         "ratio:>6.2f",
     )
     for name, (solver, steps) in SCHEMES.items():
-        extended = isinstance(solver, _splitting.AbstractSplitting)
+        kinds = _splitting.AbstractSplitting, dps.PresymplecticGauss
+        extended = isinstance(solver, kinds)
         extended = extended and not isinstance(solver, dps.TunedLinear8)
         for h in steps[:1] if quick else steps:
             ts = jnp.linspace(0.0, T1, round(T1 / h) * INSIDE + 1)
@@ -96,41 +101,67 @@ def errors(quick):
                     table.row(name, h, loop, at, anywhere, anywhere / at)
 
 
+class Timed(NamedTuple):
+    solver: dps.AbstractPresymplecticSolver
+    system: dps.AbstractHamiltonian
+    y0: tuple[jax.Array, ...]
+    t1: float
+
+
+def pendulums(copies):
+    y0 = tuple(jnp.repeat(x, copies) for x in Y0)
+    return Timed(dps.TunedRKN6(), SYSTEM, y0, T1)
+
+
+def linkage(links):
+    gauss = dps.PresymplecticGauss(6, tolerance=1e-9)
+    return Timed(gauss, rods(links), (jnp.ones(links), jnp.zeros(links)), 5.0)
+
+
+TIMED = {
+    "100 pendulums": pendulums(100),
+    "1000 pendulums": pendulums(1000),
+    "2 rods": linkage(2),
+    "3 rods": linkage(3),
+}
+
+
 def times(quick):
     table = Table(
         None,
-        "pendulums:>9d",
+        "system:<14",
         "steps:>5d",
         "end alone, us:>13.0f",
         "201 times, us:>13.0f",
         "shorter steps over that:>23.1f",
     )
-    saveats = {"end": dfx.SaveAt(t1=True)}
-    saveats |= dict.fromkeys(
-        ("shorter", "extended"), dfx.SaveAt(ts=jnp.linspace(0, T1, 201))
-    )
-    # Numbers in a state from which the extension is used.
-    usual = _splitting._MANY
-    for copies in (100,) if quick else (100, 1000):
-        for steps in (20, 50, 100, 200):
+    # What decides whether the extension is used.
+    usual = _extension._OVERHEAD
+    for name in list(TIMED)[::2] if quick else TIMED:
+        solver, system, y0, t1 = TIMED[name]
+        ts = dfx.SaveAt(ts=jnp.linspace(0, t1, 201))
+        saveats = {"end": dfx.SaveAt(t1=True), "shorter": ts, "extended": ts}
+        for steps in (25, 50, 100, 200):
             calls = {}
-            for name, saveat in saveats.items():
-                _splitting._MANY = 10**9 if name == "shorter" else usual
-                args = dps.TunedRKN6(), T1 / steps, saveat, OURS, copies
-                # Solves of equal arguments are traced once.
-                jax.clear_caches()
-                traced = jax.jit(functools.partial(run, *args)).lower()
-                calls[name] = traced.compile()
+            for k, (kind, saveat) in enumerate(saveats.items()):
+                _extension._OVERHEAD = math.inf if kind == "shorter" else usual
+                # Solves of equal arguments would be traced once.
+                options = dict(saveat=saveat, adjoint=OURS, max_steps=4096 + k)
+                run = functools.partial(
+                    solve, system, solver, 0.0, t1, t1 / steps, y0, **options
+                )
+                calls[kind] = jax.jit(lambda run=run: run().ys)
+                calls[kind]()
             measured = interleaved(calls, 9 if quick else 31)
             extended = measured["extended"]
             table.row(
-                copies,
+                name,
                 steps,
                 1e6 * measured["end"].median,
                 1e6 * extended.median,
                 measured["shorter"].over(extended),
             )
-    _splitting._MANY = usual
+    _extension._OVERHEAD = usual
 
 
 def main():

@@ -8,7 +8,7 @@ for all saved times at once.
 """
 
 from collections.abc import Callable
-from functools import partial, reduce
+from functools import cached_property, partial, reduce
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -22,7 +22,6 @@ from jaxtyping import Array, PyTree
 from ._misc import cast_to
 from ._scan import equations, repeat
 from ._solver._engine import Span
-from ._solver._extension import Segment
 from ._split import State
 from ._system import System
 
@@ -30,7 +29,9 @@ from ._system import System
 # Numbers in a state from which the outputs between steps are computed one by one,
 # rather than all at once, which would take more memory than it saves time.
 _LARGE = 512
-# Saved times at which a continuous extension is evaluated at once.
+# The same with a continuous extension, which is kept for all steps with saved times.
+_LARGE_EXTENDED = 64
+# Saved times at which it is evaluated at once for large states.
 _BLOCK = 4
 
 
@@ -139,6 +140,10 @@ class Output:
         times = jnp.searchsorted(self.held, n).astype(int)
         return jnp.where(self.empty, number, times)
 
+    def reached(self, n: Array) -> Array:
+        """Which times of `ts` are saved in the first `n` steps."""
+        return self.empty | (self.held < n)
+
     def row_of_step(self, n: Array) -> Array:
         """The row of the state after `n` steps."""
         return self.first + n // self.every - 1 + self.times(n)
@@ -194,11 +199,15 @@ class Plan:
         callbacks = self._callbacks() if timed else []
         # A callback may not support many times at once.
         self.extension = None
-        if all(x["vmap_method"] is not None for x in callbacks):
-            self.extension = self.solver.extension(self.system, self.start[0])
-        small = sum(jnp.size(x) for x in jtu.tree_leaves(self.start)) <= _LARGE
-        # Whether outputs between steps are computed at once after the last step.
-        self.at_once = timed and small and not callbacks and self.extension is None
+        t0 = self.system.time(self.steps.t0)
+        if timed and all(x["vmap_method"] is not None for x in callbacks):
+            self.extension = self.solver.extension(self.system, t0, self.start[0])
+        # Whether outputs between steps are computed at once after the last step, from
+        # the states at the starts of these steps, or from their extensions.
+        self.at_once = timed and not callbacks and self.extension is None
+        self.at_once &= _numbers(self.start) <= _LARGE
+        small = _numbers(self.start[0]) <= _LARGE_EXTENDED
+        self.keeps_segments = self.extension is not None and small
 
     @property
     def length(self) -> Array:
@@ -228,7 +237,7 @@ class Plan:
         return lax.cond(at_start, lambda: start[0], shorter)
 
     def extended(
-        self, system: System, n: Array, segment: Segment, y: State, t: Array, inside
+        self, system: System, n: Array, segment: PyTree, y: State, t: Array, inside
     ) -> State:
         """The state at a time, `inside` step `n` or at its start `y`."""
         assert self.extension is not None
@@ -245,18 +254,49 @@ class Plan:
     def all_outputs(self, i: int, parameters, starts: PyTree) -> PyTree:
         """What is saved at all times of `ts`, from the states at the starts of the
         steps that hold them."""
-        # Steps that are not made are replaced by the start of the solve, where nothing
-        # fails.
-        output = self.outputs[i]
-        made = output.start <= self.last
-        steps = jnp.where(made, output.start, 0)
-        ts = jnp.where(made, output.ts, self.steps.t0)
+        steps, ts = self._made(self.outputs[i])
         system, fns = parameters
         between = jax.vmap(partial(self.between, system))
         # Vectorised, a time that is the end of a step would cost as much as others.
         ends = jnp.all(self.steps.at(steps, ts))
         ys = lax.cond(ends, lambda: starts[0], lambda: between(steps, starts, ts))
         return jax.vmap(lambda t, y: fns[i](t, y, system.args))(ts, ys)
+
+    def _made(self, output: Output) -> tuple[Array, Array]:
+        """The steps of the saved times, and these. Those that are not made are replaced
+        by the start of the solve, where nothing fails."""
+        made = output.start <= self.last
+        steps = jnp.where(made, output.start, 0)
+        return steps, jnp.where(made, output.ts, self.steps.t0)
+
+    def no_segment(self) -> PyTree:
+        """Zeros, of the form of the continuous extension of a step."""
+        zeros = lambda x: jnp.zeros(x.shape, x.dtype)
+        return jtu.tree_map(zeros, self._segment)
+
+    @cached_property
+    def _segment(self) -> PyTree:
+        first = partial(self.segment, self.system, jnp.asarray(0))
+        return eqx.filter_eval_shape(first, self.start)
+
+    def segment(self, system: System, n: Array, start: PyTree) -> PyTree:
+        """The continuous extension of step `n`, from the state at its start."""
+        extension, span = self.extension, self.span(n)
+        assert extension is not None
+        *_, record = self.solver.recorded(extension, system, span, *start)
+        return extension.segment(system, span, start[0], record)
+
+    def all_extended(self, i: int, parameters, rows: PyTree) -> PyTree:
+        """What is saved at all times of `ts`, from the extensions of their steps."""
+        output, (system, fns) = self.outputs[i], parameters
+        steps, ts = self._made(output)
+
+        def value(n: Array, row: Array, t: Array, inside: Array) -> PyTree:
+            y, segment = jtu.tree_map(lambda x: x[row], rows)
+            y = self.extended(system, n, segment, y, t, inside)
+            return fns[i](t, y, system.args)
+
+        return jax.vmap(value)(steps, output.before, ts, output.inside)
 
     def _callbacks(self) -> list[dict[str, Any]]:
         """The calls of functions on the host in a step, and in what is saved."""
@@ -330,6 +370,8 @@ class _Extended(NamedTuple):
     plan: Plan
     output: Output
     init: PyTree
+    # What is saved is computed after the last step, from the segments of all steps.
+    later: bool
 
     @property
     def times(self) -> tuple[Array, Array]:
@@ -339,7 +381,11 @@ class _Extended(NamedTuple):
         return full(self.output.ts), full(self.output.inside)
 
     def start(self) -> tuple[PyTree, Array]:
-        return _stack(self.init, len(self.output.ts) + _BLOCK - 1), jnp.asarray(0)
+        number = len(self.output.ts)
+        if self.later:
+            init = self.plan.start[0], self.plan.no_segment()
+            return _stack(init, number), jnp.asarray(0)
+        return _stack(self.init, number + _BLOCK - 1), jnp.asarray(0)
 
     def next(self, state, never: Array) -> Array:
         _, i = state
@@ -354,6 +400,8 @@ class _Extended(NamedTuple):
         plan, output, (rows, i) = self.plan, self.output, state
         system, (y, _) = plan.system, now.state
         after = jnp.where(hit, output.after[i], i)
+        if self.later:
+            return _set(rows, i, (y, segment), hit), after
         inside = hit & self.inside(state)
 
         def value(t: Array, inside: Array) -> PyTree:
@@ -406,7 +454,7 @@ def run(inputs: Inputs, keep: Callable[[Plan], Array] | None = None):
         rows.append(_set(save.ys, 0, first(), True) if output.first else save.ys)
         stack = None
         if len(output.held) and plan.extension is not None:
-            stack = _Extended(plan, output, first())
+            stack = _Extended(plan, output, first(), plan.keeps_segments)
         elif len(output.held) and plan.at_once:
             stack = _Stack(output.start, of_state, plan.start)
         elif len(output.held):
@@ -429,6 +477,8 @@ def run(inputs: Inputs, keep: Callable[[Plan], Array] | None = None):
         ys, values = rows[i] if every[i] is None else saved[i][0], None
         if plan.at_once and stacked[i] is not None:
             values = plan.all_outputs(i, inputs.parameters, starts[i])
+        elif stacked[i] is not None and plan.keeps_segments:
+            values = plan.all_extended(i, inputs.parameters, stacked[i][0])
         elif stacked[i] is not None:
             # There may be rows that complete a block.
             number = len(output.held)
@@ -455,8 +505,8 @@ def _walk(plan: Plan, records: PyTree) -> tuple[Now, PyTree]:
             y, carry, result = solver.attempt(fitted, *span, *now.state)
         else:
             args = extension, fitted, span, *now.state
-            y, carry, result, forces = solver.recorded(*args)
-            segment = extension.segment(system, span, now.state[0], forces)
+            y, carry, result, record = solver.recorded(*args)
+            segment = extension.segment(system, span, now.state[0], record)
         end = y, carry
         if infos is not None:
             info = solver.dense_info(system, span, now.state, end)
@@ -506,9 +556,7 @@ def _walk(plan: Plan, records: PyTree) -> tuple[Now, PyTree]:
         ]
         if inside and plan.extension is not None:
             take = partial(extended, equal)
-            zeros = lambda x: jnp.zeros(x.shape, x.dtype)
-            none = jtu.tree_map(zeros, eqx.filter_eval_shape(take, now)[1])
-            leave = lambda now: (now, none)
+            leave = lambda now: (now, plan.no_segment())
             new, segment = lax.cond(reduce(jnp.logical_or, inside), take, leave, now)
         # What is saved is that at the start of this step.
         saved = [record.save(now, *rest, segment) for record, *rest in triples]
@@ -534,15 +582,24 @@ def _assemble(plan: Plan, output: Output, save, now: Now, ys, values, final: Cal
     """Diffrax's record of one output."""
     steps, n, first = plan.steps, now.n, output.first
     ts = _set(save.ts, 0, steps.t0, True) if first else save.ts
+    number = len(output.held)
+
+    def put(rows: Array, made: Array, xs: Array, x: Array) -> Array:
+        """Rows replaced by those that were made."""
+        x = x.astype(xs.dtype)
+        if output.every and number:
+            return xs.at[jnp.where(made, rows, len(xs))].set(x, mode="drop")
+        # All in order. On a CPU a scatter of 200 rows takes as long as a short solve.
+        made = made.reshape(-1, *(1,) * (x.ndim - 1))
+        x = jnp.where(made, x, xs[first : first + len(x)])
+        return lax.dynamic_update_slice_in_dim(xs, x, first, 0)
+
     if output.every:
-        ends = output.every * jnp.arange(1, len(ts) + 1)
-        rows = jnp.where(ends <= n, output.row_of_step(ends), len(ts))
-        ts = ts.at[rows].set(steps.time(ends), mode="drop")
-    if len(output.held):
-        made = jnp.arange(len(output.held)) < output.times(n)
-        rows = jnp.where(made, output.rows_of_times(), len(ts))
-        put = lambda xs, x: xs.at[rows].set(x, mode="drop")
-        ts, ys = put(ts, output.ts), jtu.tree_map(put, ys, values)
+        ends = output.every * jnp.arange(1, len(ts) - first + 1)
+        ts = put(output.row_of_step(ends), ends <= n, ts, steps.time(ends))
+    if number:
+        place = partial(put, output.rows_of_times(), output.reached(n))
+        ts, ys = place(ts, output.ts), jtu.tree_map(place, ys, values)
     saved = output.saved(n)
     if output.t1:
         separate = output.end_is_separate(n)
@@ -588,6 +645,11 @@ def _final_state(plan: Plan, now: Now, save_state):
         get = lambda state: (state.dense_ts, state.dense_infos, state.dense_save_index)
         state = eqx.tree_at(get, state, (ts, now.dense, n))
     return state
+
+
+def _numbers(state: PyTree) -> int:
+    """How many numbers a state has."""
+    return sum(jnp.size(x) for x in jtu.tree_leaves(state))
 
 
 def _stack(value: PyTree, number: int) -> PyTree:

@@ -1,6 +1,7 @@
-"""The continuous extension of splittings, which the loop of this package uses between
-steps of large states."""
+"""The continuous extensions of schemes, which the loop of this package uses between
+steps if forces take long."""
 
+import math
 from typing import Any
 
 import diffrax as dfx
@@ -11,7 +12,9 @@ import pytest
 from helpers import assert_close
 
 import diffrax_presym as dps
-from diffrax_presym._solver import _extension, _splitting
+from diffrax_presym import _loop
+from diffrax_presym._cost import nanoseconds
+from diffrax_presym._solver import _extension, _splitting_extension
 
 
 OURS = dps.ReversibleAdjoint(), dps.FixedStepAdjoint()
@@ -19,8 +22,11 @@ ONES = jnp.linspace(0.5, 1.0, 3)
 
 
 @pytest.fixture(autouse=True)
-def small_states_too(monkeypatch):
-    monkeypatch.setattr(_splitting, "_MANY", 0)
+def cheap_forces_too(monkeypatch):
+    monkeypatch.setattr(_extension, "_OVERHEAD", 0)
+    yield
+    # Solves of equal arguments are traced once.
+    jax.clear_caches()
 
 
 def potential(t, q, args):
@@ -59,6 +65,8 @@ SCHEMES = {
     "TunedRKN6": dps.TunedRKN6(),
     "BlanesCasasRKN8": dps.BlanesCasasRKN8(),
     "compensated": dps.Compensated(dps.Checked(dps.BlanesMoanRKN6())),
+    "Gauss": dps.PresymplecticGauss(3),
+    "compensated Gauss": dps.Compensated(dps.Checked(dps.PresymplecticGauss(4))),
 }
 
 
@@ -74,6 +82,8 @@ SCHEMES = {
                 "BlanesMoan6": "logarithmic",
                 "BlanesCasasRKN8": "none",
                 "compensated": "constant",
+                "Gauss": "any",
+                "compensated Gauss": "constant",
             }.items()
         ),
     ],
@@ -121,6 +131,64 @@ def test_evaluations():
         assert count(dfx.SaveAt(ts=jnp.array(times))) == expected
 
 
+def test_evaluations_of_collocation():
+    """A step with times in it costs 24 evaluations for three stages."""
+    calls = []
+
+    def energy(t, q, p, args):
+        jax.debug.callback(lambda _: calls.append(1), q)
+        return (1 + q**2) * p**2 / 2 - jnp.cos(q)
+
+    counted = dps.Hamiltonian(energy)
+    y0 = jnp.asarray(1.0), jnp.asarray(0.3)
+    solver = dps.PresymplecticGauss(3)
+
+    def count(saveat):
+        calls.clear()
+        jax.block_until_ready(solve(counted, solver, 0.5, saveat, y0=y0))
+        jax.effects_barrier()
+        return len(calls)
+
+    steps = count(dfx.SaveAt(t1=True))
+    assert count(dfx.SaveAt(ts=jnp.arange(9) / 2)) == steps
+    for times in ([0.6], [0.5, 0.6, 0.7, 0.8, 0.9, 1.0], [0.6, 2.1, 2.2, 4.0]):
+        inside = {int(2 * t) for t in times if 2 * t % 1}
+        expected = steps + 4 * 6 * len(inside)
+        assert count(dfx.SaveAt(ts=jnp.array(times))) == expected
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_what_forces_cost_decides(kept, monkeypatch):
+    """Shorter steps for cheap forces, the same solution to the error of the scheme."""
+    monkeypatch.setattr(_loop, "_LARGE_EXTENDED", 64 if kept else 0)
+    ts = jnp.linspace(0.0, 4.0, 50)
+    solve_all = lambda: solve(
+        system(), dps.TunedRKN6(), 0.25, dfx.SaveAt(subs=subs), args=1.2
+    )
+    subs = [dfx.SubSaveAt(ts=ts, t0=True), dfx.SubSaveAt(ts=ts[7:9], steps=3)]
+    finite = lambda ys: jax.tree.map(lambda x: x[np.isfinite(x)], ys)
+    extended = finite(solve_all())
+    monkeypatch.setattr(_extension, "_OVERHEAD", math.inf)
+    jax.clear_caches()
+    shorter = finite(solve_all())
+    assert_close(extended, shorter, 1e-6)
+    difference = jax.tree.map(lambda x, y: np.max(np.abs(x - y)), extended, shorter)
+    assert max(jax.tree.leaves(difference[0])) > 1e-12
+
+
+def test_costs_are_those_of_what_is_computed():
+    x = jnp.ones((50, 50))
+    product = nanoseconds(lambda x: x @ x, x)
+    assert product > 20 * nanoseconds(lambda x: x + x, x)
+    # The value of the sine is not needed for its gradient, nor what is dropped.
+    sine = nanoseconds(jnp.sin, x)
+    gradient = jax.grad(lambda x: jnp.sum(jnp.sin(x)))
+    assert nanoseconds(gradient, x) == pytest.approx(sine, rel=0.3)
+    assert nanoseconds(lambda x: (jnp.sin(x), x)[1], x) == 0
+    loop = lambda x: jax.lax.fori_loop(0, 7, lambda _, x: jnp.sin(x), x)
+    assert nanoseconds(loop, x) == pytest.approx(7 * sine, rel=0.3)
+
+
 TIMES = {
     "many in a step": jnp.linspace(0.0, 4.0, 33),
     "some": jnp.array([0.0, 0.0, 0.3, 0.5, 0.5, 0.77, 3.0, 3.99, 4.0]),
@@ -133,6 +201,8 @@ TIMES = {
         ("TunedRKN6", OURS[0], "many in a step"),
         pytest.param("compensated", OURS[0], "some", marks=pytest.mark.slow),
         pytest.param("BlanesMoan6", OURS[1], "some", marks=pytest.mark.slow),
+        pytest.param("Gauss", OURS[0], "many in a step", marks=pytest.mark.slow),
+        pytest.param("compensated Gauss", OURS[1], "some", marks=pytest.mark.slow),
     ],
 )
 def test_gradients(name, adjoint, times):
@@ -212,13 +282,13 @@ def test_batches_and_single_precision():
 def test_the_order_conditions():
     """Exact positions of an oscillator, to the order of the conditions."""
     tableau = dps.TunedRKN6.tableau
-    constants = _extension._constants(tableau)
+    constants = _splitting_extension._constants(tableau)
     for x in (0.05, 0.1):
-        forces, _ = _extension._oscillate(tableau, x)
+        forces, _ = _splitting_extension._oscillate(tableau, x)
         for s, weights in zip(constants.points[1:-1], constants.kicks, strict=True):
             q = np.array([1.0, s]) + (weights * (s - constants.times)) @ forces
             exact = np.cos(s * x), np.sin(s * x) / x
             np.testing.assert_allclose(q, exact, atol=1e-12)
     # The words that act on a force: 1, 1, 2, 3, 6, 10 and 20 of each degree.
-    degrees = [len(word) for word in _extension._words(6)]
+    degrees = [len(word) for word in _splitting_extension._words(6)]
     assert [degrees.count(k) for k in range(7)] == [1, 1, 2, 3, 6, 10, 20]

@@ -1,5 +1,6 @@
 """The loop over steps known beforehand, against that of Diffrax."""
 
+import math
 from typing import Any
 
 import diffrax as dfx
@@ -14,7 +15,7 @@ from helpers import assert_close
 import diffrax_presym as dps
 from diffrax_presym import _loop
 from diffrax_presym._scan import equations
-from diffrax_presym._solver import _splitting
+from diffrax_presym._solver import _extension, _splitting
 
 
 DIFFRAX = dfx.RecursiveCheckpointAdjoint()
@@ -106,17 +107,31 @@ def test_whatever_is_saved(seed, monkeypatch):
     subs = [random_sub(rng, t0, t1) for _ in range(rng.integers(1, 3))]
     saveat = dfx.SaveAt(subs=subs[0] if len(subs) == 1 else subs)
     max_steps = int(rng.choice([23, 64]))
-    # As for large states, whose outputs between steps are computed one by one, and by
-    # the continuous extension.
-    place = rng.integers(3)
-    if place:
-        monkeypatch.setattr(
-            *[(), (_loop, "_LARGE", 0), (_splitting, "_MANY", 0)][place]
-        )
+    # As for large states, whose outputs between steps are computed one by one, and for
+    # forces that take long, by the continuous extension, in the loop and after it.
+    place = rng.integers(4)
+    large, extended, kept = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 1, 1)][place]
+    monkeypatch.setattr(_loop, "_LARGE", 0 if large else 10**6)
+    monkeypatch.setattr(_loop, "_LARGE_EXTENDED", 10**6 if kept else 0)
+    monkeypatch.setattr(_extension, "_OVERHEAD", 0 if extended else math.inf)
     # Steps so short that interpolation is almost right to rounding.
     kwargs = dict(t0=t0, t1=t1, dt0=dt0, max_steps=max_steps, throw=False)
-    check(dps.BlanesMoanRKN6(), saveat, 1e-9 if place == 2 else 1e-10, **kwargs)
+    check(dps.BlanesMoanRKN6(), saveat, 1e-9 if extended else 1e-10, **kwargs)
     jax.clear_caches()
+
+
+def test_what_is_saved_is_not_scattered():
+    # On a CPU a scatter of 200 rows takes as long as a short solve.
+    ts = jnp.linspace(T0, T1, 30)
+    for saveat in (
+        dfx.SaveAt(t0=True, t1=True, ts=ts),
+        dfx.SaveAt(t0=True, t1=True, steps=2),
+    ):
+        saved = lambda dt0, saveat=saveat: recorded(
+            solve(OURS[0], dps.TunedRKN6(), saveat, dt0=dt0)
+        )[:2]
+        eqns = equations(jax.make_jaxpr(saved)(0.1).eqns)
+        assert not [x for x in eqns if x.primitive.name.startswith("scatter")]
 
 
 SAVEAT = dfx.SaveAt(t0=True, t1=True, steps=3, ts=jnp.array([0.5, 0.5, 0.9, 2.4]))
@@ -305,8 +320,9 @@ def test_the_error_between_steps_is_that_at_steps(
     solver, dt0, loop, reference, monkeypatch
 ):
     if loop == "extension":
-        monkeypatch.setattr(_splitting, "_MANY", 0)
-        if not isinstance(solver, _splitting.AbstractSplitting):
+        monkeypatch.setattr(_extension, "_OVERHEAD", 0)
+        kinds = _splitting.AbstractSplitting, dps.PresymplecticGauss
+        if not isinstance(solver, kinds):
             pytest.skip("no extension")
     adjoint = DIFFRAX if loop == "diffrax" else OURS[0]
     at_steps, anywhere = errors_of(adjoint, solver, dt0, reference)

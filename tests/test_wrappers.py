@@ -46,6 +46,15 @@ def one_step(solver, hamiltonian: dps.AbstractHamiltonian = DAMPED):
     return step(hamiltonian, solver, T0, T1, Y0)[0]
 
 
+@pytest.mark.parametrize("inner", [dps.Checked, dps.Compensated])
+def test_dense_output_of_wrapped_collocation(inner):
+    # Each wrapper takes off its own part of the solver state only.
+    data = lambda solver: step(NONSEPARABLE, solver, T0, T1, Y0)[2]
+    gauss = dps.PresymplecticGauss(3)
+    outer = dps.Compensated if inner is dps.Checked else dps.Checked
+    assert_close(data(outer(inner(gauss))), data(gauss), 1e-13)
+
+
 @pytest.mark.parametrize("wrap", [WRAPPERS["both"]], ids=["both"])
 @each()
 def test_a_wrapped_step_is_the_step(scheme: Scheme, wrap):

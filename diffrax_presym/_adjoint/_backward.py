@@ -199,13 +199,11 @@ class Backward:
     def _pull_times(self, i: int, at: Position, j: Array):
         """Pull back all outputs up to one of them that are saved in the same step."""
         plan, output = self.plan, self.plan.outputs[i]
-        extension, span, rows = plan.extension, plan.span(at.n), output.rows_of_times()
-        assert extension is not None
+        rows = output.rows_of_times()
 
         def segment(moved, start):
             system, _ = eqx.combine(moved, self.fixed)
-            *_, forces = self.solver.recorded(extension, system, span, *start)
-            return extension.segment(system, span, start[0], forces)
+            return plan.segment(system, at.n, start)
 
         def value(k: Array, moved, segment, y):
             system, fns = eqx.combine(moved, self.fixed)
@@ -246,7 +244,7 @@ class Backward:
             return eqx.filter(saved, eqx.is_inexact_array)
 
         rows = output.rows_of_times()
-        made = jnp.arange(len(rows)) < output.times(self.trace.n)
+        made = output.reached(self.trace.n)
 
         def bar(x):
             keep = made.reshape(-1, *(1,) * (x.ndim - 1))

@@ -29,7 +29,7 @@ class ReversibleAdjoint(AbstractFixedStepAdjoint):
     or without gradients, the fast loop for steps that are known beforehand.
 
     Saved times cost little, and between steps the solution has the full order of the
-    scheme: it is a shorter step of the scheme itself or, for large states, its
+    scheme: it is a shorter step of the scheme itself or, where forces take long, its
     continuous extension.
 
     The gradient is that of the discrete solution ("discretise, then optimise"). It

@@ -1,10 +1,12 @@
 import abc
 import bisect
+from collections.abc import Callable
 from functools import partial
 from typing import ClassVar, Generic, NamedTuple, TYPE_CHECKING, TypeVar
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -28,7 +30,7 @@ from ._engine import (
     time_lengths,
 )
 from ._estimate import no_error_estimate
-from ._extension import Extension
+from ._extension import AbstractExtension
 
 
 if TYPE_CHECKING:
@@ -41,7 +43,7 @@ else:
 _Carry = TypeVar("_Carry")
 
 # Points within a step that dense output uses, from the order up to which they suffice.
-_ORDERS, _INNER_POINTS = (2, 4, 10), (0, 1, 3, 5)
+_ORDERS, _INNER_POINTS = (2, 4, 10, 14), (0, 1, 3, 5, 7)
 
 
 class Tabulated(NamedTuple):
@@ -185,8 +187,8 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         y, carry, result = self.advance(system, t0, t1, h, y, carry)
         return y, carry, first_failure(result, system.check(t1, y))
 
-    def extension(self, system: System, y: State) -> Extension | None:
-        """The continuous extension of the scheme, if there is one."""
+    def extension(self, system: System, t: Array, y: State) -> AbstractExtension | None:
+        """The continuous extension of the scheme, if there is one that pays."""
         return None
 
     # What a wrapper keeps of a scheme is part of its own solver state.
@@ -201,19 +203,28 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
 
     def recorded(
         self,
-        extension: Extension,
+        extension: AbstractExtension,
         system: System,
         span: Span,
         y: State,
         carry: _Carry,
     ) -> tuple[State, _Carry, Result, PyTree]:
-        """As `attempt`, and the forces that the extension needs."""
-        inner = self.inner_carry(carry)
-        start = self.with_inner_carry(carry, extension.record(y, inner))
+        """As `attempt`, and what the extension needs of the step."""
+        inner = extension.recording(y, self.inner_carry(carry))
+        start = self.with_inner_carry(carry, inner)
         y, end, result = self.attempt(system, *span, y, start)
-        record = self.inner_carry(end)
-        end = self.with_inner_carry(end, None if inner is None else record.last)
-        return y, end, result, extension.forces(record)
+        inner, record = extension.recorded(y, self.inner_carry(end))
+        return y, self.with_inner_carry(end, inner), result, record
+
+    def within(
+        self,
+        system: System,
+        span: Span,
+        start: tuple[State, _Carry],
+        end: tuple[State, _Carry],
+    ) -> Callable[[Array], State] | None:
+        """The solution within a step, if the end of the step tells enough of it."""
+        return None
 
     def between(
         self, system: System, t0: Array, start: tuple[State, _Carry], t: Array
@@ -279,12 +290,16 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         if number == 0:
             return info
 
+        within = self.within(system, span, start, end)
+        state = within or partial(self.between, system, t0, start)
+
         def at(fraction):
             t = t0 + fraction * h
-            y = self.between(system, t0, start, t)
+            y = state(t)
             return y, tree_scale(h, system.slope(t, y))
 
-        return info | dict(inner=lax.map(at, cast_to(inner_points(number), h)))
+        each = lax.map if within is None else lambda f, x: jax.vmap(f)(x)
+        return info | dict(inner=each(at, cast_to(inner_points(number), h)))
 
     def func(self, terms, t0, y0, args):
         return terms.vf(t0, y0, args)

@@ -1,10 +1,10 @@
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from .._split import State
 from .._system import System
 from ._base import AbstractPresymplecticSolver, AbstractWrapper
-from ._engine import Moves, Stages
-from ._extension import Extension
+from ._engine import Moves, Span, Stages
+from ._extension import AbstractExtension
 from ._moves import check_finite
 
 
@@ -34,8 +34,11 @@ class Checked(AbstractWrapper[PyTree]):
         """
         self.base = base
 
-    def extension(self, system: System, y: State) -> Extension | None:
-        return self.base.extension(system, y)
+    def extension(self, system: System, t: Array, y: State) -> AbstractExtension | None:
+        return self.base.extension(system, t, y)
+
+    def within(self, system: System, span: Span, start, end):
+        return self.base.within(system, span, start, end)
 
     def moves(self, system: System) -> Moves:
         moves = self.base.moves(system), check_finite

@@ -6,8 +6,8 @@ from .._misc import as_positive, cast_to, Sum
 from .._split import State
 from .._system import System
 from ._base import AbstractPresymplecticSolver, AbstractWrapper
-from ._engine import Moves, Stages
-from ._extension import Extension
+from ._engine import Moves, Span, Stages
+from ._extension import AbstractExtension
 from ._moves import to_sums
 
 
@@ -80,8 +80,12 @@ class Compensated(AbstractWrapper[PyTree]):
         moves = to_sums, self.base.moves(system), to_sums.inverse
         return Stages(moves, [(0, 0, 0), (0, 1, 1), (1, 1, 0)])
 
-    def extension(self, system: System, y: State) -> Extension | None:
-        return self.base.extension(system, y)
+    def extension(self, system: System, t: Array, y: State) -> AbstractExtension | None:
+        return self.base.extension(system, t, y)
+
+    def within(self, system: System, span: Span, start, end):
+        of_base = [(y, carry[0]) for y, carry in (start, end)]
+        return self.base.within(system, span, *of_base)
 
     def inner_carry(self, carry: PyTree) -> PyTree:
         return self.base.inner_carry(carry[0])

@@ -2,19 +2,17 @@ import math
 from typing import ClassVar, TYPE_CHECKING
 
 import equinox as eqx
-import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._scan import cheap_iterations
 from .._split import AbstractSplit, State
 from .._system import System
 from ._base import AbstractMoveSolver
 from ._composition import rows
 from ._engine import Moves, Stages
-from ._extension import Extension, number_of_points
+from ._extension import pays
 from ._moves import drift, kick, to_split
+from ._splitting_extension import number_of_points, SplittingExtension
 from ._tableaus import (
     BLANES_CASAS_RKN_8,
     BLANES_MOAN_4,
@@ -33,11 +31,6 @@ if TYPE_CHECKING:
     from typing import ClassVar as AbstractVar
 else:
     from equinox import AbstractVar
-
-
-# Numbers in a state from which the continuous extension is faster than shorter steps
-# for all saved times at once, as measured.
-_MANY = 128
 
 
 class AbstractSplitting(AbstractMoveSolver[PyTree]):
@@ -118,18 +111,17 @@ class AbstractSplitting(AbstractMoveSolver[PyTree]):
             spans = [(0, 0, 0), (0, 1, 1), drifts[-1], (1, 1, 0)]
         return Stages(moves, spans)
 
-    def extension(self, system: System, y: State) -> Extension | None:
+    def extension(
+        self, system: System, t: Array, y: State
+    ) -> SplittingExtension | None:
         # Of other systems the drifts are not multiples of the velocity.
         known = system.split("shared") is not None and self.kind != "shared"
-        # Shorter steps are faster for few numbers, for all saved times at once, and for
-        # schemes of few kicks. On a GPU, where a loop over steps costs more than their
-        # evaluations, the extension has not been measured.
-        many = sum(jnp.size(x) for x in jtu.tree_leaves(y)) >= _MANY
-        many = many and cheap_iterations()
-        kicks = len(self.tableau.fractions[1::2])
-        if not (known and many and kicks > number_of_points(self.tableau)):
+        numbers = len(self.tableau.fractions[1::2]), number_of_points(self.tableau)
+        if not known or numbers[0] <= numbers[1]:
             return None
-        return Extension(self.tableau)
+        if not pays(*numbers, system.potential_force, t, y):
+            return None
+        return SplittingExtension(self.tableau)
 
     def slope(self, system: System, t: Array, y: State, carry: PyTree) -> State:
         # Otherwise a kick is by a part of the force only.
