@@ -158,7 +158,8 @@ def test_a_solve_that_fails():
             dps.HamiltonianTerm(system),
             dps.Checked(dps.PresymplecticLeapfrog()),
             *(T0, T1, 0.1, (jnp.ones(1), jnp.zeros(1))),
-            saveat=dfx.SaveAt(ts=jnp.linspace(T0, T1, 9), steps=2, t1=True),
+            # Times in each step, also in the one that fails.
+            saveat=dfx.SaveAt(ts=jnp.linspace(T0, T1, 45), steps=2, t1=True),
             adjoint=adjoint,
             throw=False,
             max_steps=64,
@@ -167,7 +168,7 @@ def test_a_solve_that_fails():
     ours: Any = run(OURS[0])
     theirs: Any = run(DIFFRAX)
     assert ours.result == theirs.result != dfx.RESULTS.successful
-    assert 0 < jnp.sum(jnp.isfinite(theirs.ts)) < 20
+    assert 0 < jnp.sum(jnp.isfinite(theirs.ts)) < 56
     np.testing.assert_allclose(ours.ts, theirs.ts, rtol=1e-15)
 
 
