@@ -1,10 +1,10 @@
 """`diffeqsolve` with our schemes against hand-written loops of the same schemes.
 
 Through the loop of `ReversibleAdjoint`. The other side is what a person would write for
-speed: the force by hand, the damping of a step computed once, its moves fused, as many
-steps as an integer says, and outputs where they are known to be: at the end, at all
-steps, or at 100 times that are steps. A row gives the median time per step of each
-side, and the median of the ratios of interleaved runs.
+speed: the force by hand, the damping of a step computed once, its moves fused, and
+outputs where they are known to be: at the end, at all steps, or at 100 times that are
+steps. On both sides the number of steps is known when they are compiled. A row gives
+the median time per step of each side, and the median of the ratios of interleaved runs.
 """
 
 import functools
@@ -68,9 +68,9 @@ def by_hand(scheme, potential, saved, steps):
     step, start = scheme(POTENTIALS[potential][1])
 
     @jax.jit
-    def run(q, p, steps_now):
+    def run(q, p):
         if saved == "t1":
-            y = lax.fori_loop(0, steps_now, lambda _, y: step(y), start(q, p))
+            y = lax.fori_loop(0, steps, lambda _, y: step(y), start(q, p))
             return y[:2]
         inner = 1 if saved == "steps" else steps // OUTPUTS
 
@@ -99,12 +99,12 @@ def ours(solver, potential, saved, steps):
     }[saved]
 
     @jax.jit
-    def run(q, p, steps_now):
+    def run(q, p):
         sol = solve(
             hamiltonian,
             solver,
             0.0,
-            steps_now * DT,
+            steps * DT,
             DT,
             (q, p),
             saveat=saveat,
@@ -150,7 +150,7 @@ def main():
                         ours(solver, potential, saved, steps),
                         by_hand(scheme, potential, saved, steps),
                     )
-                    calls = [functools.partial(side, *y0, steps) for side in sides]
+                    calls = [functools.partial(side, *y0) for side in sides]
                     ends = [jax.tree.leaves(call()) for call in calls]
                     for a, b in zip(*ends, strict=True):
                         np.testing.assert_allclose(a, b, rtol=0, atol=1e-9)

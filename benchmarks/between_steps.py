@@ -6,15 +6,15 @@ which takes shorter steps, or where forces take long (100 copies of the pendulum
 the continuous extension of the scheme. The error is the largest entry of the difference
 to a solution by `SofroniouSpaletta10` with small steps.
 
-A second table is the time of solves that save 201 times, of pendulums by `TunedRKN6`
-and of chains of rods by `PresymplecticGauss(6, tolerance=1e-9)`: of the solve that
-saves its end alone, and with shorter steps over that with the extension, each in pairs
-of runs.
+A second table is the time of solves that save 201 times, of pendulums by `TunedRKN6`,
+of chains of rods by `PresymplecticGauss(6, tolerance=1e-9)`, and of oscillators of
+which the energy is a product by `PresymplecticGauss(4, tolerance=1e-6)`: of the solve
+that saves its end alone, and with shorter steps over that with the extension, each in
+pairs of runs.
 """
 
 import functools
-import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import jax
@@ -26,7 +26,7 @@ from _timing import interleaved
 from gauss import rods
 
 import diffrax_presym as dps
-from diffrax_presym._solver import _extension, _splitting
+from diffrax_presym._solver import _splitting
 
 
 jax.config.update("jax_enable_x64", True)
@@ -118,11 +118,20 @@ def linkage(links):
     return Timed(gauss, rods(links), (jnp.ones(links), jnp.zeros(links)), 5.0)
 
 
+def products(copies):
+    energy = lambda t, q, p, args: jnp.sum((q**2 + 1) * (p**2 + 1)) / 2
+    gauss = dps.PresymplecticGauss(4, tolerance=1e-6)
+    y0 = jnp.linspace(0.5, 1.0, copies), jnp.zeros(copies)
+    return Timed(gauss, dps.Hamiltonian(energy), y0, 10.0)
+
+
 TIMED = {
     "100 pendulums": pendulums(100),
     "1000 pendulums": pendulums(1000),
     "2 rods": linkage(2),
     "3 rods": linkage(3),
+    "10 products": products(10),
+    "40 products": products(40),
 }
 
 
@@ -135,16 +144,17 @@ def times(quick):
         "201 times, us:>13.0f",
         "shorter steps over that:>23.1f",
     )
-    # What decides whether the extension is used.
-    usual = _extension._OVERHEAD
+    none = lambda *args: None
     for name in list(TIMED)[::2] if quick else TIMED:
         solver, system, y0, t1 = TIMED[name]
+        method: Any = type(solver)
+        extension = method.extension
         ts = dfx.SaveAt(ts=jnp.linspace(0, t1, 201))
         saveats = {"end": dfx.SaveAt(t1=True), "shorter": ts, "extended": ts}
         for steps in (25, 50, 100, 200):
             calls = {}
             for k, (kind, saveat) in enumerate(saveats.items()):
-                _extension._OVERHEAD = math.inf if kind == "shorter" else usual
+                method.extension = none if kind == "shorter" else extension
                 # Solves of equal arguments would be traced once.
                 options = dict(saveat=saveat, adjoint=OURS, max_steps=4096 + k)
                 run = functools.partial(
@@ -161,7 +171,6 @@ def times(quick):
                 1e6 * extended.median,
                 measured["shorter"].over(extended),
             )
-    _extension._OVERHEAD = usual
 
 
 def main():
