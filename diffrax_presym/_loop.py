@@ -524,7 +524,13 @@ def _walk(plan: Plan, records: PyTree) -> tuple[Now, PyTree]:
     if can_fail:
         now = now._replace(result=jtu.tree_map(jnp.asarray, dfx.RESULTS.successful))
     well = lambda now: now.result == dfx.RESULTS.successful
-    going = lambda now: not can_fail or well(now)
+
+    def there(well: Array, new: Now, old: Now) -> Now:
+        """The former where a solve has not failed before."""
+        dense = new.dense  # without a selection, as nothing is read after the failure
+        new, old = (x._replace(dense=None) for x in (new, old))
+        select = lambda x, y: jnp.where(well, x, y)
+        return jtu.tree_map(select, new, old)._replace(dense=dense)
 
     def advance(equal: bool, stop: Array, now: Now) -> Now:
         left = lambda now: stop - now.n
@@ -534,8 +540,9 @@ def _walk(plan: Plan, records: PyTree) -> tuple[Now, PyTree]:
     flat, structure = jtu.tree_flatten(records, is_leaf=is_record)
     states = [record.start() for record in flat]
     # The loop stops for nothing else, so that each stop is one of the record's.
-    alone = len(flat) == 1 and not can_fail
+    alone = len(flat) == 1
     each = alone and isinstance(flat[0], _Every) and flat[0].output.every == 1
+    each = each and not can_fail
 
     def due(states) -> list[Array]:
         never = plan.last + 1
@@ -547,7 +554,7 @@ def _walk(plan: Plan, records: PyTree) -> tuple[Now, PyTree]:
         wanted = due(states)
         at = reduce(jnp.minimum, wanted)
         now = step(equal, now) if each else advance(equal, at, now)
-        hits = [alone or (w == at) & (now.n == at) for w in wanted]
+        hits = [alone or w == at for w in wanted]
         new, segment, triples = now, None, list(zip(flat, states, hits, strict=True))
         inside = [
             hit & record.inside(state)
@@ -558,13 +565,17 @@ def _walk(plan: Plan, records: PyTree) -> tuple[Now, PyTree]:
             take = partial(extended, equal)
             leave = lambda now: (now, plan.no_segment())
             new, segment = lax.cond(reduce(jnp.logical_or, inside), take, leave, now)
-        # What is saved is that at the start of this step.
+            if can_fail:
+                new = there(now.n == at, new, now)
+        # What is saved is that at the start of this step. A solve that has failed is
+        # not there, and what is saved of it is dropped at the end: in a batch all stop
+        # at the same steps, and no row is selected.
+        now = now._replace(n=at)
         saved = [record.save(now, *rest, segment) for record, *rest in triples]
         return new, saved
 
     def more(last: Array, x):
-        now, states = x
-        return (reduce(jnp.minimum, due(states)) <= last) & going(now)
+        return reduce(jnp.minimum, due(x[1])) <= last
 
     def run(equal: bool, last: Array, now: Now, states):
         if flat:
@@ -590,10 +601,12 @@ def _assemble(plan: Plan, output: Output, save, now: Now, ys, values, final: Cal
         if output.every and number:
             return xs.at[jnp.where(made, rows, len(xs))].set(x, mode="drop")
         # All in order. On a CPU a scatter of 200 rows takes as long as a short solve.
-        made = made.reshape(-1, *(1,) * (x.ndim - 1))
-        x = jnp.where(made, x, xs[first : first + len(x)])
+        x = _where(made, x, xs[first : first + len(x)])
         return lax.dynamic_update_slice_in_dim(xs, x, first, 0)
 
+    if output.every and now.result is not None:
+        reached = jnp.arange(len(ts)) < output.saved(n)
+        ys = jtu.tree_map(partial(_where, reached), ys, save.ys)
     if output.every:
         ends = output.every * jnp.arange(1, len(ts) - first + 1)
         ts = put(output.row_of_step(ends), ends <= n, ts, steps.time(ends))
@@ -650,6 +663,11 @@ def _final_state(plan: Plan, now: Now, save_state):
 def _numbers(state: PyTree) -> int:
     """How many numbers a state has."""
     return sum(jnp.size(x) for x in jtu.tree_leaves(state))
+
+
+def _where(rows: Array, x: Array, y: Array) -> Array:
+    """The rows of one array, or of another."""
+    return jnp.where(rows.reshape(-1, *(1,) * (x.ndim - 1)), x, y)
 
 
 def _stack(value: PyTree, number: int) -> PyTree:

@@ -146,30 +146,83 @@ def test_too_many_steps():
         jax.block_until_ready(sol.ys)
 
 
-def test_a_solve_that_fails():
-    def funnel(t, q, args):
-        return jnp.sum(jnp.sqrt(q))
+def funnel(t, q, args):
+    return jnp.sum(jnp.sqrt(q))
 
-    def run(adjoint):
-        system = dps.ConformalHamiltonian(
-            dps.QuadraticKinetic(), funnel, dps.ConstantDamping(0.1)
-        )
-        return dfx.diffeqsolve(
-            dps.HamiltonianTerm(system),
-            dps.Checked(dps.PresymplecticLeapfrog()),
-            *(T0, T1, 0.1, (jnp.ones(1), jnp.zeros(1))),
-            # Times in each step, also in the one that fails.
-            saveat=dfx.SaveAt(ts=jnp.linspace(T0, T1, 45), steps=2, t1=True),
-            adjoint=adjoint,
-            throw=False,
-            max_steps=64,
-        )
 
-    ours: Any = run(OURS[0])
-    theirs: Any = run(DIFFRAX)
-    assert ours.result == theirs.result != dfx.RESULTS.successful
-    assert 0 < jnp.sum(jnp.isfinite(theirs.ts)) < 56
-    np.testing.assert_allclose(ours.ts, theirs.ts, rtol=1e-15)
+@eqx.filter_jit
+def run_into_funnel(adjoint, solver, saveat, q):
+    system = dps.ConformalHamiltonian(
+        dps.QuadraticKinetic(), funnel, dps.ConstantDamping(0.1)
+    )
+    return dfx.diffeqsolve(
+        dps.HamiltonianTerm(system),
+        solver,
+        *(T0, T1, 0.1, (q, jnp.zeros(1))),
+        saveat=saveat,
+        adjoint=adjoint,
+        throw=False,
+        max_steps=64,
+    )
+
+
+FAILING = {
+    # Times in each step, also in the one that fails.
+    "all": dfx.SaveAt(ts=jnp.linspace(T0, T1, 45), steps=2, t1=True),
+    "steps": dfx.SaveAt(t0=True, steps=1),
+    "times": dfx.SaveAt(ts=jnp.linspace(T0, T1, 45)),
+}
+
+
+@pytest.mark.parametrize("saved", FAILING)
+def test_a_batch_in_which_solves_fail(saved):
+    """Each as alone in Diffrax's loop, with as many rows."""
+    solver = dps.Checked(dps.PresymplecticLeapfrog())
+    run: Any = run_into_funnel
+    of = lambda adjoint: lambda q: run(adjoint, solver, FAILING[saved], q)
+    # The first fails earlier than the second, the last does not.
+    qs = jnp.array([[0.3], [1.0], [9.0]])
+    visible = lambda sol: (sol.result == dfx.RESULTS.successful, sol.ts, sol.ys)
+    went_well, times, states = jax.vmap(lambda q: visible(of(OURS[0])(q)))(qs)
+    numbers = jnp.sum(jnp.isfinite(times), axis=1)
+    assert 1 < numbers[0] < numbers[1] < numbers[2]
+    for k, q in enumerate(qs):
+        one, theirs = (of(adjoint)(q) for adjoint in (OURS[0], DIFFRAX))
+        failed = theirs.result != dfx.RESULTS.successful
+        assert failed == (k < 2) != went_well[k] and one.result == theirs.result
+        np.testing.assert_allclose(one.ts, theirs.ts, rtol=1e-15)
+        np.testing.assert_allclose(times[k], one.ts, rtol=1e-15)
+        for batch, a, b in zip(states, one.ys, theirs.ys, strict=True):
+            np.testing.assert_allclose(batch[k], a, rtol=1e-13)
+            np.testing.assert_array_equal(np.isinf(a), np.isinf(b))
+            # Between steps they differ by the interpolation, which is not a number in
+            # the step that fails.
+            known = np.isfinite(b)
+            np.testing.assert_allclose(a[known], b[known], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    "solver", [dps.Checked(dps.PresymplecticLeapfrog()), dps.PresymplecticGauss(2)]
+)
+def test_a_batch_of_solves_that_may_fail_stops_at_the_same_steps(solver, monkeypatch):
+    """Otherwise the rows of all solves would be copied at each of the steps."""
+    monkeypatch.setattr(_extension, "_OVERHEAD", 0)
+    number = 37
+    saveat = dfx.SaveAt(ts=jnp.linspace(T0, T1, number))
+    batch = jax.vmap(lambda q: run_into_funnel(OURS[0], solver, saveat, q).ys)
+    jax.clear_caches()
+    eqns = jax.make_jaxpr(batch)(jnp.ones((3, 1))).eqns
+    loops = [
+        x.params["body_jaxpr"] for x in equations(eqns) if "body_jaxpr" in x.params
+    ]
+    assert loops
+    stored = [
+        x.invars[1].aval.shape
+        for x in equations([y for loop in loops for y in loop.eqns])
+        if x.primitive.name == "scatter" and number in x.outvars[0].aval.shape
+    ]
+    # Each at one index, not at one for each solve.
+    assert stored and all(len(shape) == 1 for shape in stored)
 
 
 @pytest.mark.parametrize(
