@@ -64,6 +64,12 @@ class AbstractDamping(AbstractFriction):
         return quadrature(after, h, order)
 
     @property
+    def is_smooth(self) -> bool:
+        """Whether the rate is known to have a continuous derivative, which schemes in
+        the shared frame need. `False` by default: a function may jump."""
+        return False
+
+    @property
     def is_scalar(self) -> bool:
         """Whether one rate acts on all momenta."""
         value = jax.eval_shape(self.rate, jax.ShapeDtypeStruct((), jnp.zeros(()).dtype))
@@ -209,6 +215,7 @@ class ConstantDamping(AbstractDamping):
     """
 
     gamma: Numbers
+    is_smooth = True
 
     def __init__(self, gamma):
         """**Arguments:**
@@ -260,6 +267,7 @@ class LogDamping(AbstractDamping):
 
     gamma: Numbers
     shift: Numbers
+    is_smooth = True
 
     def __init__(self, gamma, shift: ArrayLike = 0.0):
         """**Arguments:**
@@ -334,6 +342,7 @@ class MixedDamping(AbstractDamping):
     gamma1: Numbers
     gamma2: Numbers
     delta: Numbers
+    is_smooth = True
 
     def __init__(self, gamma1, gamma2, delta):
         r"""**Arguments:**
@@ -408,6 +417,10 @@ class ScaledDamping(AbstractDamping):
     law: AbstractDamping
     factor: ArrayLike
 
+    @property
+    def is_smooth(self) -> bool:
+        return self.law.is_smooth
+
     def __call__(self, t: Time) -> Numbers:
         return tree_scale(self.law(t), self.factor)
 
@@ -429,6 +442,10 @@ class SumDamping(AbstractDamping):
     """Several laws at once."""
 
     laws: tuple[AbstractDamping, ...]
+
+    @property
+    def is_smooth(self) -> bool:
+        return all(law.is_smooth for law in self.laws)
 
     def _sum(self, values) -> Numbers:
         return functools.reduce(_add, values)

@@ -99,7 +99,8 @@ class SeparableEnergy(eqx.Module):
             splits.append(PotentialSplit())
         # Other energies quadratic in `p` may have a mass that depends on time.
         if isinstance(kinetic, QuadraticKinetic) and is_scalar(friction):
-            splits.append(SharedSplit(kinetic, friction))
+            if friction is None or friction.is_smooth:
+                splits.append(SharedSplit(kinetic, friction))
         return tuple(splits)
 
     def displacement(self, t: Time, h: Time, p: P, args: PyTree, friction, order) -> Q:

@@ -147,6 +147,8 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         carry = self.start(system, t0, y0)
         if system.friction is None or not system.friction.has_table(y0[1]):
             return carry
+        if not len(self.lengths(system)):
+            return carry
         h = self.step_length(t0, t1)
         system = self.tabulated(system, h, y0)
         return Tabulated(carry, system.table)  # pyright: ignore[reportReturnType]
@@ -397,4 +399,4 @@ def step_of(solver: AbstractPresymplecticSolver) -> Move:
         return (y, carry), result
 
     # Inverted only after a check that there is an adjoint method.
-    return Move(partial(step, solver), partial(step, solver.reverse))
+    return Move(partial(step, solver), partial(step, solver.reverse), is_step=True)

@@ -61,10 +61,12 @@ class Move(NamedTuple):
 
     do: Callable[[System, Span, Stage], Outcome]
     undo: Callable[[System, Span, Stage], Outcome]
+    # Whether it is a whole step, in which friction acts over parts that are not known.
+    is_step: bool = False
 
     @property
     def inverse(self) -> "Move":
-        return Move(self.undo, self.do)
+        return Move(self.undo, self.do, self.is_step)
 
 
 class Stages:
@@ -92,18 +94,25 @@ Moves: TypeAlias = Move | Stages
 
 
 def time_lengths(moves: Moves) -> np.ndarray:
-    """The distinct lengths of the moves that advance time, in units of the step."""
+    """The distinct lengths of the moves that advance time, in units of the step.
+
+    None if they are not known.
+    """
+    unknown = False
 
     def each(moves: Moves):
+        nonlocal unknown
         if isinstance(moves, Stages):
             for row in moves.table:
                 for move, (start, end, length) in zip(moves.moves, row, strict=True):
                     if start != end:
                         yield from (length * x for x in each(move))
         else:
+            unknown |= moves.is_step
             yield 1.0
 
-    return np.unique(np.round(list(each(moves)), 15))
+    lengths = np.unique(np.round(list(each(moves)), 15))
+    return lengths[:0] if unknown else lengths
 
 
 def forward(moves: Moves, system: System, span: Span, stage: Stage) -> Outcome:

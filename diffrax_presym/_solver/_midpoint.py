@@ -1,5 +1,4 @@
 import equinox as eqx
-import numpy as np
 import optimistix as optx
 
 from .._misc import check_root_finder, tree_scale
@@ -46,9 +45,6 @@ class PresymplecticMidpoint(AbstractMoveSolver[None]):
     def order(self, terms) -> int:
         return 2
 
-    def lengths(self, system: System) -> np.ndarray:
-        return np.array([0.5])
-
     def moves(self, system: System) -> Moves:
         find = root_find(self.root_finder, self.root_find_max_steps)
 
@@ -66,7 +62,7 @@ class PresymplecticMidpoint(AbstractMoveSolver[None]):
             q, p = system.add(y, 2, dy)
             return ((q, system.move_frame(middle, half, p)), carry), result
 
-        return Move(step, step)
+        return Move(step, step, is_step=True)
 
 
 PresymplecticMidpoint.__init__.__doc__ = """**Arguments:**

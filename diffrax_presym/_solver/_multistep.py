@@ -184,7 +184,8 @@ class SymmetricMultistep(AbstractMoveSolver[_Carry]):
             return split
         raise ValueError(
             "`SymmetricMultistep` needs a second-order equation with a constant mass, "
-            "and friction with one rate for all momenta. Write "
+            "and friction with one rate for all momenta, with a derivative: that of a "
+            "function eta(t) may jump. Write "
             "`ConformalHamiltonian(QuadraticKinetic(mass), potential, damping)` or "
             "`SeparableHamiltonian(QuadraticKinetic(mass), potential)`. For this "
             f"`{system.name}` use `TunedRKN6()`, `BlanesMoan6()` or "

@@ -62,7 +62,8 @@ class AbstractSplitting(AbstractMoveSolver[PyTree]):
         if self.kind == "shared":
             raise ValueError(
                 f"`{name}` needs a known mass that does not depend on time, and one "
-                "rate of friction for all momenta. Write "
+                "rate of friction for all momenta, with a derivative: that of a "
+                "function eta(t) may jump. Write "
                 "`ConformalHamiltonian(QuadraticKinetic(mass), potential, damping)` or "
                 "`SeparableHamiltonian(QuadraticKinetic(mass), potential)`. Otherwise "
                 "use `TunedRKN6()` or `BlanesMoan6()`."

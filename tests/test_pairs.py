@@ -1,0 +1,399 @@
+"""All pairs of entries of the catalogue: refused, or what is claimed.
+
+A row takes one entry of each list, and each pair of entries is in some row. It is
+compared with SciPy on the bare equations: the order from several numbers of steps, the
+error of all that is saved, the bare scheme in the loop of Diffrax, and gradients by
+central differences.
+"""
+
+import dataclasses
+import itertools
+import os
+import random
+import re
+import subprocess
+from functools import cache, partial
+
+import catalogue
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import pytest
+from catalogue import claim, offered, Problem, reference, Refused
+from jax.flatten_util import ravel_pytree
+
+import diffrax_presym as dps
+
+
+FACTORS = {
+    "scheme": catalogue.SCHEMES,
+    "friction": catalogue.FRICTION,
+    "system": catalogue.SYSTEMS,
+    "way": catalogue.WAYS,
+    "gradient": catalogue.GRADIENTS,
+    "wrapper": catalogue.WRAPPERS,
+    "precision": catalogue.PRECISIONS,
+}
+
+
+def possible(row: dict) -> bool:
+    """Whether some entries can be tried together. What is refused is tried apart, since
+    a row of it would test none of its other pairs."""
+    scheme, friction, way = (row.get(k) for k in ("scheme", "friction", "way"))
+    if "system" in row and isinstance(claim(row["system"], friction, scheme), Refused):
+        return False
+    if "wrapper" in row and row["wrapper"].composes and not scheme.composable:
+        return False
+    if way is not None and way.backwards and friction.limit is not None:
+        return False
+    return "gradient" not in row or way.own == row["gradient"].own
+
+
+@cache
+def covering() -> list[dict]:
+    """Rows that have all possible pairs: greedily, entry by entry.
+
+    (The greedy algorithm of allpairspy loses pairs to conditions such as these.)
+    """
+    rng = random.Random(0)
+    seen = set()
+    pairs = lambda row: set(itertools.combinations(sorted(map(str, row.items())), 2))
+
+    def complete(row: dict) -> dict:
+        for name, entries in FACTORS.items():
+            if name not in row:
+                options = [row | {name: x} for x in entries]
+                options = [x for x in options if possible(x)]
+                rng.shuffle(options)
+                row = max(options, key=lambda x: len(pairs(x) - seen))
+        seen.update(pairs(row))
+        return row
+
+    table = []
+    for scheme, friction in itertools.product(*list(FACTORS.values())[:2]):
+        row = {"scheme": scheme, "friction": friction}
+        if any(possible(row | {"system": x}) for x in catalogue.SYSTEMS):
+            table.append(complete(row))
+    # Pairs with a system, of which each scheme and each friction takes only some.
+    triples = [
+        dict(zip(FACTORS, x, strict=False))
+        for x in itertools.product(*list(FACTORS.values())[:3])
+    ]
+    for row in filter(possible, triples):
+        if pairs(row) - seen:
+            table.append(complete(row))
+    return table
+
+
+# One row.
+
+NUMBERS = [4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256]
+STRICT = jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise")
+
+
+def flat(y) -> np.ndarray:
+    return np.concatenate([np.ravel(np.asarray(x, float)) for x in jtu.tree_leaves(y)])
+
+
+def build(system, friction):
+    external = {} if friction.external is None else {"force": friction.external}
+    return system.build(friction.laws(system), **external)
+
+
+def make(scheme, precision):
+    finder = [catalogue.finder(precision)] if scheme.implicit else []
+    return scheme.make(*finder)
+
+
+class Run:
+    """A row as a function of the number of steps and what can be differentiated."""
+
+    def __init__(self, row: dict, adjoint, precision: str):
+        self.row, self.way = row, row["way"]
+        self.system = build(row["system"], row["friction"])
+        self.bare = make(row["scheme"], precision)
+        self.solver = row["wrapper"].wrap(self.bare)
+        t0, t1 = catalogue.span(row["system"], row["friction"])
+        self.t0, self.t1 = (jnp.asarray(t, precision) for t in (t0, t1))
+        self.adjoint, self.precision = adjoint, precision
+        y0 = catalogue.start(row["system"], row["friction"])
+        if self.way.backwards:
+            exact = reference(row["system"], row["friction"])(t1)[0]
+            y0 = ravel_pytree(y0)[1](jnp.asarray(exact))
+        self.y0 = jtu.tree_map(lambda x: jnp.asarray(x, precision), y0)
+
+    def outputs(self, n, system, y0):
+        problem = Problem(system, self.solver, self.t0, self.t1, self.adjoint)
+        return self.way.run(problem, n, y0)
+
+    @property
+    def compiled(self):
+        if not self.way.prescribed:
+            fn = eqx.filter_jit(lambda n, *x: self.outputs(n, *x))
+            return lambda n, *x: fn(jnp.asarray(n, self.precision), *x)
+        return lambda n, *x: eqx.filter_jit(partial(self.outputs, n))(*x)
+
+    def error(self, saved) -> float:
+        """The largest error of what was saved."""
+        exact, worst = reference(self.row["system"], self.row["friction"]), 0.0
+        for ts, ys in saved:
+            taken = np.isfinite(np.asarray(ts))
+            assert np.any(taken)
+            for t, i in zip(np.asarray(ts)[taken], np.flatnonzero(taken), strict=True):
+                y = flat(jtu.tree_map(lambda x, i=i: x[i], ys))
+                # A time of single precision is where the solution was asked for.
+                worst = max(worst, np.max(np.abs(y - exact(t)[0])))
+        return worst
+
+
+def successful(result) -> bool:
+    return bool(result == dfx.RESULTS.successful)
+
+
+def check_order(run: Run, claimed: float, rounding: float):
+    """The slope over the three smallest steps with errors above rounding."""
+    solve, errors = run.compiled, {}
+    numbers = [8, 12, 16] if run.way.prescribed else NUMBERS
+    least = 24 if run.row["scheme"].name.startswith("multistep") else 4
+    for n in numbers:
+        saved, result = solve(max(n, least), run.system, run.y0)
+        if not successful(result):
+            continue
+        error = run.error(saved)
+        if error < 5 * rounding and errors:
+            break
+        errors[max(n, least)] = error
+    assert errors, "no solve was successful"
+    assert min(errors.values()) < 0.1
+    last = sorted(errors)[-3:]
+    if len(last) < 3 or errors[last[0]] < 30 * rounding:
+        # Too accurate for its order to be seen.
+        return
+    x, y = np.log(last), np.log([errors[n] for n in last])
+    slopes = -np.diff(y) / np.diff(x)
+    order = max(-np.polyfit(x, y, 1)[0], np.min(slopes))
+    assert order > claimed - (0.4 if claimed < 8 else 0.9), (
+        f"order {order:.2f}, {errors}"
+    )
+
+
+def check_bare(run: Run, rounding: float):
+    """The end of the solve is that of the bare scheme in the loop of Diffrax."""
+    row, way, n = run.row, run.way, 16
+    steps = row["wrapper"].steps
+    if steps is None or not way.end or not way.equal:
+        return
+    saved, result = run.compiled(n, run.system, run.y0)
+    assert successful(result)
+    term = dps.HamiltonianTerm(run.system)
+    dt0 = (run.t1 - run.t0) / (n * steps)
+    sol = eqx.filter_jit(dfx.diffeqsolve)(
+        term, run.bare, run.t0, run.t1, dt0, run.y0, max_steps=256
+    )
+    difference = np.max(np.abs(flat(last(saved[-1][1])) - flat(last(sol.ys))))
+    assert difference <= rounding, f"{difference:.1e} from the bare scheme"
+
+
+def last(ys):
+    return jtu.tree_map(lambda y: y[-1], ys)
+
+
+def check_gradient(run: Run, tolerance: float):
+    """A derivative along a direction, of all that is saved and all that is a number."""
+    rng, n = np.random.default_rng(1), 8 if run.way.prescribed else 12.0
+    n = 24.0 if run.row["scheme"].name.startswith("multistep") and n == 12.0 else n
+    inputs, static = eqx.partition((run.system, run.y0), eqx.is_inexact_array)
+    singular = run.row["friction"].limit is not None
+
+    def draw(x):
+        dx = jnp.asarray(rng.standard_normal(x.shape) * 0.1, x.dtype)
+        # A solve from a singularity only starts there, and from rest.
+        dx = dx * (jnp.abs(x) + (0.0 if singular else 0.1))
+        # A mass matrix stays symmetric.
+        symmetric = x.ndim == 2 and x.shape[0] == x.shape[1] and jnp.all(x == x.T)
+        return (dx + dx.T) / 2 if symmetric else dx
+
+    along = jtu.tree_map(draw, inputs)
+
+    def loss(inputs):
+        saved, _ = run.outputs(n, *eqx.combine(inputs, static))
+        total = 0.0
+        for i, (ts, ys) in enumerate(saved):
+            for k, y in enumerate(jtu.tree_leaves(ys)):
+                finite = jnp.isfinite(ts).reshape(-1, *(1,) * (y.ndim - 1))
+                weights = jnp.cos(jnp.arange(y.size) + i + k).reshape(y.shape)
+                y = jnp.where(finite, y, 0).astype(float)
+                total = total + jnp.sum(weights.astype(float) * y)
+        return total
+
+    if run.row["gradient"].name == "forward mode":
+        found = jax.jit(lambda x, dx: jax.jvp(loss, (x,), (dx,))[1])(inputs, along)
+    else:
+        bars = jax.jit(jax.grad(loss))(inputs)
+        products = jtu.tree_map(
+            lambda a, b: jnp.sum((a * b).astype(float)), bars, along
+        )
+        found = sum(jtu.tree_leaves(products))
+    value, h = jax.jit(loss), 1e-5
+    move = lambda s: jtu.tree_map(lambda x, dx: x + s * h * dx, inputs, along)
+    wanted = (value(move(1)) - value(move(-1))) / (2 * h)
+    assert abs(found - wanted) <= tolerance * max(abs(wanted), 0.1), (
+        f"{found}, {wanted}"
+    )
+
+
+def check(row: dict):
+    """One row: whether it keeps what it claims."""
+    scheme, friction, way = row["scheme"], row["friction"], row["way"]
+    claimed = claim(*(row[k] for k in ("system", "friction", "scheme", "wrapper")))
+    assert not isinstance(claimed, Refused)
+    if way.name == "unequal steps" and scheme.name.startswith("multistep"):
+        claimed = min(claimed, 8)  # all steps are those of the start
+    run = Run(row, row["gradient"].adjoint(), "float64")
+    by_reversal = isinstance(run.adjoint, dps.ReversibleAdjoint)
+    if by_reversal and run.solver.reverse is None:
+        with pytest.raises(ValueError, match="FixedStepAdjoint"):
+            run.compiled(8, run.system, run.y0)
+        return
+    if catalogue.fails(friction, scheme, row["wrapper"]):
+        assert not successful(run.compiled(16, run.system, run.y0)[1])
+        return
+    # Implicit schemes are as accurate as their root finder.
+    rounding = 1e-9 if scheme.implicit else 1e-11
+    if not way.order or (friction.kink is not None and not way.equal):
+        saved, result = run.compiled(16, run.system, run.y0)
+        assert successful(result)
+        assert run.error(saved) < 2e-3 * (100 if claimed == 1 else 1)
+    elif row["precision"] == "float64":
+        check_order(run, claimed, rounding)
+    if row["precision"] == "float64":
+        check_bare(run, rounding)
+        # A controller does not differentiate the steps that it chooses.
+        if way.order:
+            check_gradient(run, 1e-4 if scheme.implicit else 1e-6)
+        return
+    single = Run(row, run.adjoint, "float32")
+    (saved, result), (exact, _) = (
+        x.compiled(32, x.system, x.y0) for x in (single, run)
+    )
+    assert successful(result)
+    for (_, y), (_, z) in zip(saved, exact, strict=True):
+        assert all(x.dtype == jnp.float32 for x in jtu.tree_leaves(y))
+        assert all(jtu.tree_leaves(jtu.tree_map(_near, y, z)))
+
+
+def _near(y, z):
+    y, z = np.asarray(y, float), np.asarray(z, float)
+    finite = np.isfinite(z)
+    return np.max(np.abs(np.where(finite, y - z, 0)), initial=0) < 2e-4
+
+
+# What is refused.
+
+
+@cache
+def refusals() -> dict[str, list[tuple]]:
+    """By scheme, what it must refuse: of systems that differ in nothing that matters,
+    one. Without a scheme, systems that do not take a friction."""
+    found, seen = {}, set()
+    for system, friction in itertools.product(catalogue.SYSTEMS, catalogue.FRICTION):
+        splits = offered(system, friction)
+        if isinstance(splits, Refused):
+            found.setdefault("systems", []).append((system, friction, None))
+            continue
+        for scheme in catalogue.SCHEMES:
+            key = scheme, friction, splits
+            if isinstance(claim(system, friction, scheme), Refused) and key not in seen:
+                seen.add(key)
+                found.setdefault(str(scheme), []).append((system, friction, scheme))
+    return found
+
+
+def check_refusal(system, friction, scheme):
+    """An error before any compute that says what to write instead."""
+    with pytest.raises(ValueError) as error:
+        built = build(system, friction)
+        y0 = jtu.tree_map(jnp.asarray, catalogue.start(system, friction))
+        solver = dfx.Tsit5() if scheme is None else make(scheme, "float64")
+        problem = Problem(built, solver, 0.5, 1.0, dfx.RecursiveCheckpointAdjoint())
+        jax.eval_shape(lambda: problem.solve(0.1, y0, dfx.SaveAt(t1=True)).ys)
+    assert re.search("(?i)write|use |pass ", str(error.value)), error.value
+
+
+def check_composition(scheme, wrapper):
+    with pytest.raises(ValueError) as error:
+        wrapper.wrap(make(scheme, "float64"))
+    assert re.search("(?i)write|use |compose ", str(error.value)), error.value
+
+
+# Which are tried when.
+
+SAMPLE = 24
+
+
+def seed() -> int:
+    """The commit, so that each tries another sample."""
+    run = subprocess.run(
+        ["git", "rev-parse", "--short=7", "HEAD"],
+        cwd=os.path.dirname(__file__),
+        capture_output=True,
+        text=True,
+    )
+    return int(run.stdout, 16) if run.returncode == 0 else 0
+
+
+def rows():
+    table = covering()
+    sample = set(random.Random(seed()).sample(range(len(table)), SAMPLE))
+    marks = lambda i: [] if i in sample else [pytest.mark.slow]
+    name = lambda row: " | ".join(map(str, row.values()))
+    return [
+        pytest.param(row, id=name(row), marks=marks(i)) for i, row in enumerate(table)
+    ]
+
+
+@pytest.mark.parametrize("row", rows())
+def test_pair(row, record_property):
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        check(row)
+    record_property("pairs", 1)
+
+
+@pytest.mark.parametrize("scheme", list(refusals()))
+@pytest.mark.slow
+def test_refusals(scheme, record_property):
+    for refusal in refusals()[scheme]:
+        check_refusal(*refusal)
+    record_property("refused", len(refusals()[scheme]))
+
+
+def test_some_refusals():
+    everything = [x for some in refusals().values() for x in some]
+    for refusal in random.Random(seed()).sample(everything, SAMPLE):
+        check_refusal(*refusal)
+    for scheme, wrapper in itertools.product(catalogue.SCHEMES, catalogue.WRAPPERS):
+        if wrapper.composes and not scheme.composable:
+            check_composition(scheme, wrapper)
+
+
+def test_all_that_is_exported_is_in_the_catalogue():
+    def classes(x):
+        yield type(x)
+        if dataclasses.is_dataclass(x):
+            for field in dataclasses.fields(x):
+                yield from classes(getattr(x, field.name))
+        elif isinstance(x, list | tuple):
+            for y in x:
+                yield from classes(y)
+
+    schemes = [make(scheme, "float64") for scheme in catalogue.SCHEMES]
+    wrapped = [wrapper.wrap(dps.Strang()) for wrapper in catalogue.WRAPPERS]
+    systems = [build(system, catalogue.FRICTION[0]) for system in catalogue.SYSTEMS]
+    laws = [x.laws(catalogue.SYSTEMS[6]) for x in catalogue.FRICTION]
+    found = {x.__name__ for x in classes([schemes, wrapped, systems, laws])}
+    public = {name for name in vars(dps) if name[0].isupper()}
+    missing = {name for name in public - found if not name.startswith("Abstract")}
+    assert missing == catalogue.ELSEWHERE

@@ -1,0 +1,207 @@
+"""Wrong numbers with a successful result, each found once from outside."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import pytest
+import scipy.linalg
+from helpers import harmonic, solve
+
+import diffrax_presym as dps
+
+
+successful = dfx.RESULTS.successful
+END = dict(max_steps=20_000, throw=False)
+C = np.array([[0.5, 0.4], [0.1, 0.8]])
+Y0 = (jnp.array([1.0, -0.5]), jnp.array([0.2, 0.3]))
+
+
+def last(sol):
+    return jax.tree.map(lambda y: y[-1], sol.ys)
+
+
+def by_matrix(t):
+    """The oscillator with friction by the matrix `C`."""
+    zero, one = np.zeros((2, 2)), np.eye(2)
+    flow = scipy.linalg.expm(t * np.block([[zero, one], [-one, -C]]))
+    return flow @ np.concatenate(Y0)
+
+
+@pytest.mark.parametrize("adjoint", [None, dps.FixedStepAdjoint()], ids=repr)
+@pytest.mark.parametrize(
+    "solver",
+    [dps.PresymplecticGauss(4), dps.Checked(dps.PresymplecticGauss(3))],
+    ids=lambda x: type(x).__name__,
+)
+def test_matrix_friction_with_collocation(solver, adjoint):
+    system = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), harmonic, friction=dps.ViscousDamping(jnp.asarray(C))
+    )
+    options = {} if adjoint is None else {"adjoint": adjoint}
+    sol = solve(system, solver, 0.0, 5.0, 0.2, Y0, **END, **options)
+    assert np.max(np.abs(np.concatenate(last(sol)) - by_matrix(5.0))) < 1e-7
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [dps.TunedLinear8(), dps.SymmetricMultistep(8)],
+    ids=lambda x: type(x).__name__,
+)
+def test_a_rate_that_may_jump_where_it_must_be_smooth(solver):
+    law = lambda t: 0.5 * jnp.maximum(t - 4.03, 0)
+    system = dps.ConformalHamiltonian(dps.QuadraticKinetic(), harmonic, law)
+    with pytest.raises(ValueError, match="may jump"):
+        solve(system, solver, 0.0, 10.0, 0.1, Y0)
+
+
+@pytest.mark.xfail(strict=True, reason="the continuous extension of splittings")
+@pytest.mark.parametrize("gamma", [40.0, 100.0])
+def test_saved_times_with_strong_friction(gamma):
+    # Of many unknowns.
+    system = dps.ConformalHamiltonian(
+        dps.QuadraticKinetic(),
+        lambda t, q, args: -jnp.sum(jnp.cos(q)),
+        dps.ConstantDamping(gamma),
+    )
+    q0 = jnp.linspace(0.5, 2.5, 100)
+    errors = []
+    for ts in ([5.0, 5.5], [5.1, 5.25, 5.4]):
+        ts = jnp.array(ts)
+        options = dict(saveat=dfx.SaveAt(ts=ts), adjoint=dps.FixedStepAdjoint())
+        both = [
+            solve(system, dps.TunedRKN6(), 0.0, 10.0, h, (q0, 0 * q0), **options)
+            for h in (0.5, 0.025)
+        ]
+        errors.append(np.max(np.abs(both[0].ys[1] - both[1].ys[1])))
+    assert errors[1] < 3 * errors[0] + 1e-4
+
+
+@pytest.mark.xfail(strict=True, reason="amplification by stages backwards in time")
+@pytest.mark.parametrize(
+    "solver, gamma",
+    [(dps.BlanesMoanRKN4(), 100.0), (dps.BlanesMoan6(), 100.0)],
+    ids=lambda x: getattr(type(x), "__name__", ""),
+)
+@pytest.mark.parametrize("adjoint", [None, dps.FixedStepAdjoint()], ids=repr)
+def test_stages_backwards_in_time_under_strong_friction(solver, gamma, adjoint):
+    # A strongly damped joint among ordinary ones.
+    rates = jnp.array([0.1, gamma])
+    system = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), harmonic, friction=dps.ConstantDamping(rates)
+    )
+    options = {} if adjoint is None else {"adjoint": adjoint}
+    y0 = jnp.ones(2), jnp.zeros(2)
+    sol = solve(system, solver, 0.0, 10.0, 1.0, y0, **END, **options)
+    exact = np.exp(-10 / gamma)
+    assert sol.result != successful or abs(last(sol)[0][1] - exact) < 1e-2
+
+
+@pytest.mark.xfail(strict=True, reason="the number of steps of an infinite span")
+def test_an_infinite_span():
+    system = dps.ConformalHamiltonian(dps.QuadraticKinetic(), harmonic, None)
+    sol = dfx.diffeqsolve(
+        dps.HamiltonianTerm(system),
+        dps.PresymplecticLeapfrog(),
+        *(0.0, jnp.inf, 0.1, Y0),
+        **{"max_steps": 30, "throw": False, "adjoint": dps.FixedStepAdjoint()},
+    )
+    assert sol.result == dfx.RESULTS.max_steps_reached
+    assert sol.stats["num_steps"] == 30
+
+
+@pytest.mark.xfail(strict=True, reason="laws times numbers by quadrature")
+def test_equal_laws_from_a_singularity_are_equally_accurate():
+    pendulum = lambda t, q, args: -jnp.sum(jnp.cos(q))
+    y0, numbers = (jnp.array([1.0, 2.0]), jnp.zeros(2)), jnp.array([3.0, 2.0])
+    ends = []
+    for law in (
+        dps.LogDamping(numbers),
+        dps.ViscousDamping(numbers, dps.LogDamping(1.0)),
+        [dps.LogDamping(numbers - 1), dps.LogDamping(1.0)],
+    ):
+        system = dps.MechanicalSystem(dps.QuadraticKinetic(), pendulum, friction=law)
+        ends.append(last(solve(system, dps.TunedRKN6(), 0.0, 2.0, 0.25, y0)))
+    for end in ends[1:]:
+        np.testing.assert_allclose(end[0], ends[0][0], rtol=1e-12)
+
+
+@pytest.mark.xfail(strict=True, reason="the exponential over an infinite time")
+def test_a_matrix_times_a_law_from_its_singularity():
+    # A matrix that is a number.
+    ends = []
+    for law in (
+        dps.ViscousDamping(3.0 * jnp.eye(2), dps.LogDamping(1.0)),
+        dps.LogDamping(3.0),
+    ):
+        system = dps.MechanicalSystem(dps.QuadraticKinetic(), harmonic, friction=law)
+        y0 = jnp.array([1.0, 2.0]), jnp.zeros(2)
+        ends.append(last(solve(system, dps.TunedRKN6(), 0.0, 2.0, 0.125, y0)))
+    assert np.all(np.isfinite(ends[0]))
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-5)
+
+
+@pytest.mark.xfail(strict=True, reason="cancellation in the series is not seen")
+@pytest.mark.parametrize("size", [5.0, 11.0, 14.0])
+def test_friction_by_an_operator_in_single_precision(size):
+    matrix = np.diag(np.linspace(0.1, size, 8).astype(np.float32))
+    p0 = jnp.ones(8, jnp.float32)
+    like = jax.ShapeDtypeStruct((8,), jnp.float32)
+    operator = lx.FunctionLinearOperator(lambda v: jnp.asarray(matrix) @ v, like)
+    system = dps.MechanicalSystem(
+        dps.QuadraticKinetic(),
+        lambda t, q, args: 0.0 * jnp.sum(q),
+        friction=dps.ViscousDamping(operator),
+    )
+    t0, t1 = jnp.float32(0), jnp.float32(1)
+    sol = solve(system, dps.Strang(), t0, t1, t1, (0 * p0, p0), **END)
+    _, p = last(sol)
+    exact = np.exp(-np.diag(matrix).astype(float))
+    accurate = np.max(np.abs(p - exact)) < 2e-5
+    assert accurate or not np.all(np.isfinite(p))
+
+
+@pytest.mark.xfail(strict=True, reason="the root of zero between different particles")
+def test_two_particles_at_one_place():
+    potential = dps.pairwise_potential(lambda t, r, args: -1 / jnp.sqrt(1 + r**2))
+    q = jnp.array([[0.0, 0.0], [0.0, 0.0], [1.0, 0.0]])
+    force = jax.grad(lambda q: potential(0.0, q, None))(q)
+    assert np.all(np.isfinite(force))
+
+
+@pytest.mark.xfail(strict=True, reason="the distance one of a particle to itself")
+def test_an_energy_that_is_infinite_at_the_distance_one():
+    energy = lambda t, r, c: c / (r**2 - 1) ** 2
+    potential = dps.pairwise_potential(energy)
+    q = jnp.array([[0.0, 0.0], [2.0, 0.0]])
+    slope = jax.grad(lambda c: potential(0.0, q, c))(2.0)
+    np.testing.assert_allclose(slope, 1 / 9)
+
+
+@pytest.mark.xfail(
+    strict=True, reason="`work_precision` takes the fastest, however bad"
+)
+def test_the_fastest_solver_reaches_the_tolerance():
+    # Solves of one phase of a force of short period agree with each other.
+    run = dps.diagnostics.WorkPrecisionRun("fast", 1e-5, 2.5e-2, 1.0, 10, 10)
+    good = dps.diagnostics.WorkPrecisionRun("slow", 1e-5, 5e-6, 2.0, 10, 10)
+    found = dps.diagnostics.WorkPrecision(1e-5, (run, good), {})
+    assert found.fastest == "slow"
+
+
+@pytest.mark.xfail(strict=True, reason="nothing looks at the final state")
+@pytest.mark.parametrize("saveat", [dfx.SaveAt(t1=True), dfx.SaveAt(ts=[0.5, 40.0])])
+def test_a_step_that_is_too_large_is_a_failure(saveat):
+    saveat = jax.tree.map(jnp.asarray, saveat)
+    system = dps.ConformalHamiltonian(
+        dps.QuadraticKinetic(), lambda t, q, args: jnp.sum(q**4) / 4, None
+    )
+    sol = dfx.diffeqsolve(
+        dps.HamiltonianTerm(system),
+        dps.TunedRKN6(),
+        *(0.0, 50.0, 5.0, Y0),
+        **{"saveat": saveat, "throw": False, "adjoint": dps.FixedStepAdjoint()},
+    )
+    assert not np.all(np.isfinite(last(sol)[0]))
+    assert sol.result != successful
