@@ -53,9 +53,6 @@ SCHEMES = {
     "PresymplecticCoupled(6)": Scheme(dps.PresymplecticCoupled(6), 6, 27),
     # Six stages at once, in each of several iterations.
     "PresymplecticGauss(6)": Scheme(dps.PresymplecticGauss(6), 12, 40),
-    "PresymplecticProjected(2)": Scheme(dps.PresymplecticProjected(2), 2, 3),
-    "PresymplecticProjected(4)": Scheme(dps.PresymplecticProjected(4), 4, 11),
-    "PresymplecticProjected(6)": Scheme(dps.PresymplecticProjected(6), 6, 27),
 }
 DIFFRAX = {
     "Tsit5": Scheme(dfx.Tsit5(), 5, 6),

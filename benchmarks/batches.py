@@ -94,7 +94,7 @@ def pendulums():
     problem = problems.pendulum()
     polynomial = dps.ConformalHamiltonian(
         dps.QuadraticKinetic(),
-        lambda t, q, args: -jnp.sum(dps.math.cos(q)),
+        lambda t, q, args: -jnp.sum(jnp.cos(q)),
         problem.hamiltonian.damping,
     )
     return Batch(

@@ -44,9 +44,8 @@ COPIES = {
     "Coupled, 2": SCHEMES["PresymplecticCoupled(2)"],
     "Coupled, 4": SCHEMES["PresymplecticCoupled(4)"],
     "Coupled, 6": SCHEMES["PresymplecticCoupled(6)"],
-    "Projected, 4": SCHEMES["PresymplecticProjected(4)"],
 }
-MIDPOINT = dps.PresymplecticMidpoint(NEWTON)
+MIDPOINT = dps.PresymplecticGauss(1, NEWTON)
 IMPLICIT = {
     "Midpoint, implicit": Scheme(MIDPOINT, 2, 40),
     "Suzuki4 of Midpoint": Scheme(dps.Suzuki4(MIDPOINT), 4, 200),
@@ -156,13 +155,10 @@ TAO = dps.PresymplecticTao
 LONG = {
     "Tao": SCHEMES["PresymplecticTao"],
     "Coupled": SCHEMES["PresymplecticCoupled(2)"],
-    "Projected": SCHEMES["PresymplecticProjected(2)"],
     "Suzuki4 of Tao, 10": Scheme(dps.Suzuki4(TAO(10.0)), 4, 15),
     "Suzuki4 of Tao, 20": Scheme(dps.Suzuki4(TAO(20.0)), 4, 15),
     "Coupled, 4": SCHEMES["PresymplecticCoupled(4)"],
-    "Projected, 4": SCHEMES["PresymplecticProjected(4)"],
     "Coupled, 6": SCHEMES["PresymplecticCoupled(6)"],
-    "Projected, 6": SCHEMES["PresymplecticProjected(6)"],
 }
 
 

@@ -1,6 +1,6 @@
 """Presymplectic integrators for Diffrax."""
 
-from . import diagnostics as diagnostics, math as math
+from . import diagnostics as diagnostics
 from ._adjoint import (
     FixedStepAdjoint as FixedStepAdjoint,
     ReversibleAdjoint as ReversibleAdjoint,
@@ -28,13 +28,10 @@ from ._hamiltonian import (
     EuclideanMirror as EuclideanMirror,
     ExponentialScaling as ExponentialScaling,
     Hamiltonian as Hamiltonian,
-    HyperbolicMirror as HyperbolicMirror,
     LagrangianSystem as LagrangianSystem,
-    LogBarrierMirror as LogBarrierMirror,
     MechanicalSystem as MechanicalSystem,
     MirrorMap as MirrorMap,
     pairwise_potential as pairwise_potential,
-    PNormMirror as PNormMirror,
     PolynomialScaling as PolynomialScaling,
     QuadraticKinetic as QuadraticKinetic,
     QuadraticPotential as QuadraticPotential,
@@ -58,8 +55,6 @@ from ._solver import (
     PresymplecticEuler as PresymplecticEuler,
     PresymplecticGauss as PresymplecticGauss,
     PresymplecticLeapfrog as PresymplecticLeapfrog,
-    PresymplecticMidpoint as PresymplecticMidpoint,
-    PresymplecticProjected as PresymplecticProjected,
     PresymplecticTao as PresymplecticTao,
     PresymplecticYoshida4 as PresymplecticYoshida4,
     SofroniouSpaletta6 as SofroniouSpaletta6,

@@ -2,13 +2,12 @@
 
 Diffrax's loop asks after each step whether something is to be saved in it. Here the
 steps, and those in which the saved times fall, are known, so that the loop runs from
-one to the next without asking. Between steps the solution is the continuous extension
-of the scheme, or else a shorter step of it, of the full order in both cases, computed
-for all saved times at once.
+one to the next without asking. Between steps the solution is a shorter step of the
+scheme, of its full order, computed for all saved times at once.
 """
 
 from collections.abc import Callable
-from functools import cached_property, partial, reduce
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -20,19 +19,14 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
 from ._misc import cast_to
-from ._scan import equations, repeat
+from ._scan import repeat
 from ._solver._engine import Span
-from ._split import State
 from ._system import System
 
 
 # Numbers in a state from which the outputs between steps are computed one by one,
 # rather than all at once, which would take more memory than it saves time.
 _LARGE = 512
-# The same with a continuous extension, which is kept for all steps with saved times.
-_LARGE_EXTENDED = 64
-# Saved times at which it is evaluated at once for large states.
-_BLOCK = 4
 
 
 class Steps:
@@ -110,8 +104,6 @@ class Output:
         self.t1 = sub.t1 and sub.steps != 1
         self.ts: Array = jnp.zeros(0) if sub.ts is None else sub.ts
         self.held = self.start = jnp.zeros(0, int)
-        self.inside, self.before = jnp.zeros(0, bool), self.start
-        self.after = self.start
         self.empty = steps.total == 0
         if sub.ts is not None:
             # The step that each time is in, and the one from whose start it is
@@ -122,14 +114,6 @@ class Output:
             made = step < last
             self.held = jnp.where(made, step, last + 1)
             self.start = jnp.where(made, jnp.where(ends, step + 1, step), last + 1)
-            # Whether it differs from the state at that start.
-            self.inside = made & ~ends & ~steps.at(step, sub.ts)
-            # The numbers of times that are computed from earlier steps, and of those
-            # that are not from later ones.
-            self.before, self.after = (
-                jnp.searchsorted(self.start, self.start, side=side).astype(int)
-                for side in ("left", "right")
-            )
 
     def times(self, n: Array) -> Array:
         """The number of times of `ts` saved in the first `n` steps."""
@@ -196,18 +180,9 @@ class Plan:
             for sub, fn in zip(subs, fns, strict=True)
         ]
         timed = any(len(output.held) for output in self.outputs)
-        callbacks = self._callbacks() if timed else []
-        # A callback may not support many times at once.
-        self.extension = None
-        t0 = self.system.time(self.steps.t0)
-        if timed and all(x["vmap_method"] is not None for x in callbacks):
-            self.extension = self.solver.extension(self.system, t0, self.start[0])
         # Whether outputs between steps are computed at once after the last step, from
-        # the states at the starts of these steps, or from their extensions.
-        self.at_once = timed and not callbacks and self.extension is None
-        self.at_once &= _numbers(self.start) <= _LARGE
-        small = _numbers(self.start[0]) <= _LARGE_EXTENDED
-        self.keeps_segments = self.extension is not None and small
+        # the states at the starts of these steps.
+        self.at_once = timed and _numbers(self.start) <= _LARGE
 
     @property
     def length(self) -> Array:
@@ -236,16 +211,6 @@ class Plan:
         shorter = lambda: self.solver.between(system, t0, start, t)
         return lax.cond(at_start, lambda: start[0], shorter)
 
-    def extended(
-        self, system: System, n: Array, segment: PyTree, y: State, t: Array, inside
-    ) -> State:
-        """The state at a time, `inside` step `n` or at its start `y`."""
-        assert self.extension is not None
-        # At its start friction may be infinite.
-        t = system.time(jnp.where(inside, t, self.steps.time(n + 1)))
-        at = self.extension.at(system, self.span(n), segment, t)
-        return jtu.tree_map(partial(jnp.where, inside), at, y)
-
     def output(self, i: int, parameters, n: Array, start: PyTree, t: Array) -> PyTree:
         """What is saved at a time in step `n`."""
         system, fns = parameters
@@ -268,49 +233,6 @@ class Plan:
         made = output.start <= self.last
         steps = jnp.where(made, output.start, 0)
         return steps, jnp.where(made, output.ts, self.steps.t0)
-
-    def no_segment(self) -> PyTree:
-        """Zeros, of the form of the continuous extension of a step."""
-        zeros = lambda x: jnp.zeros(x.shape, x.dtype)
-        return jtu.tree_map(zeros, self._segment)
-
-    @cached_property
-    def _segment(self) -> PyTree:
-        first = partial(self.segment, self.system, jnp.asarray(0))
-        return eqx.filter_eval_shape(first, self.start)
-
-    def segment(self, system: System, n: Array, start: PyTree) -> PyTree:
-        """The continuous extension of step `n`, from the state at its start."""
-        extension, span = self.extension, self.span(n)
-        assert extension is not None
-        *_, record = self.solver.recorded(extension, system, span, *start)
-        return extension.segment(system, span, start[0], record)
-
-    def all_extended(self, i: int, parameters, rows: PyTree) -> PyTree:
-        """What is saved at all times of `ts`, from the extensions of their steps."""
-        output, (system, fns) = self.outputs[i], parameters
-        steps, ts = self._made(output)
-
-        def value(n: Array, row: Array, t: Array, inside: Array) -> PyTree:
-            y, segment = jtu.tree_map(lambda x: x[row], rows)
-            y = self.extended(system, n, segment, y, t, inside)
-            return fns[i](t, y, system.args)
-
-        return jax.vmap(value)(steps, output.before, ts, output.inside)
-
-    def _callbacks(self) -> list[dict[str, Any]]:
-        """The calls of functions on the host in a step, and in what is saved."""
-        fns = [output.fn for output in self.outputs if len(output.held)]
-        arrays, static = eqx.partition((self.system, fns, self.start), eqx.is_array)
-
-        def save(arrays):
-            system, fns, start = eqx.combine(arrays, static)
-            y, *_ = self.solver.advance(system, *self.span(jnp.asarray(0)), *start)
-            values = [fn(self.steps.t1, y, system.args) for fn in fns]
-            return eqx.filter(values, eqx.is_array)
-
-        called = equations(jax.make_jaxpr(save)(arrays).eqns)
-        return [x.params for x in called if x.primitive.name == "pure_callback"]
 
 
 class Now(NamedTuple):
@@ -337,7 +259,7 @@ class _Stack(NamedTuple):
         _, i = state
         return jnp.where(i < len(self.steps), self.steps[i], never)
 
-    def save(self, now: Now, state, hit, segment: PyTree):
+    def save(self, now: Now, state, hit):
         rows, i = state
         return _set(rows, i, self.value(i, now), hit), i + jnp.where(hit, 1, 0)
 
@@ -357,75 +279,11 @@ class _Every(NamedTuple):
         _, k = state
         return k * self.output.every
 
-    def save(self, now: Now, state, hit, segment: PyTree):
+    def save(self, now: Now, state, hit):
         rows, k = state
         value = self.output.fn(self.time(now.n), now.state[0], self.args)
         rows = _set(rows, self.output.row_of_step(now.n), value, hit)
         return rows, k + jnp.where(hit, 1, 0)
-
-
-class _Extended(NamedTuple):
-    """What is saved at times in steps, by the continuous extension of these."""
-
-    plan: Plan
-    output: Output
-    init: PyTree
-    # What is saved is computed after the last step, from the segments of all steps.
-    later: bool
-
-    @property
-    def times(self) -> tuple[Array, Array]:
-        """The times and whether they are in steps, in full blocks from any time on."""
-        last = lambda x: jnp.broadcast_to(x[-1:], _BLOCK - 1)
-        full = lambda x: jnp.concatenate([x, last(x)])
-        return full(self.output.ts), full(self.output.inside)
-
-    def start(self) -> tuple[PyTree, Array]:
-        number = len(self.output.ts)
-        if self.later:
-            init = self.plan.start[0], self.plan.no_segment()
-            return _stack(init, number), jnp.asarray(0)
-        return _stack(self.init, number + _BLOCK - 1), jnp.asarray(0)
-
-    def next(self, state, never: Array) -> Array:
-        _, i = state
-        return jnp.where(i < len(self.output.start), self.output.start[i], never)
-
-    def inside(self, state) -> Array:
-        """Whether the next step has times that are not its start."""
-        _, i = state
-        return self.output.inside[self.output.after[i] - 1]
-
-    def save(self, now: Now, state, hit, segment: PyTree):
-        plan, output, (rows, i) = self.plan, self.output, state
-        system, (y, _) = plan.system, now.state
-        after = jnp.where(hit, output.after[i], i)
-        if self.later:
-            return _set(rows, i, (y, segment), hit), after
-        inside = hit & self.inside(state)
-
-        def value(t: Array, inside: Array) -> PyTree:
-            at = plan.extended(system, now.n, segment, y, t, inside)
-            return output.fn(t, at, system.args)
-
-        times = self.times
-
-        def block(x):
-            j, rows = x
-            part = lambda x: lax.dynamic_slice_in_dim(x, j, _BLOCK)
-            new = jax.vmap(value)(*map(part, times))
-            put = lambda xs, x: lax.dynamic_update_slice_in_dim(
-                xs, cast_to(x, xs), j, 0
-            )
-            return j + _BLOCK, jtu.tree_map(put, rows, new)
-
-        def same(j: Array, rows: PyTree) -> PyTree:
-            return _set(rows, j, output.fn(output.ts[j], y, system.args), True)
-
-        # Loops of no iterations, since a branch would copy all rows.
-        more = lambda x: inside & (x[0] < after)
-        j, rows = lax.while_loop(more, block, (i, rows))
-        return lax.fori_loop(j, after, same, rows), after
 
 
 class Trace(NamedTuple):
@@ -453,9 +311,7 @@ def run(inputs: Inputs, keep: Callable[[Plan], Array] | None = None):
         first = partial(output.fn, plan.steps.t0, plan.start[0], args)
         rows.append(_set(save.ys, 0, first(), True) if output.first else save.ys)
         stack = None
-        if len(output.held) and plan.extension is not None:
-            stack = _Extended(plan, output, first(), plan.keeps_segments)
-        elif len(output.held) and plan.at_once:
+        if len(output.held) and plan.at_once:
             stack = _Stack(output.start, of_state, plan.start)
         elif len(output.held):
             value = lambda j, now, i=i, output=output: plan.output(
@@ -477,12 +333,8 @@ def run(inputs: Inputs, keep: Callable[[Plan], Array] | None = None):
         ys, values = rows[i] if every[i] is None else saved[i][0], None
         if plan.at_once and stacked[i] is not None:
             values = plan.all_outputs(i, inputs.parameters, starts[i])
-        elif stacked[i] is not None and plan.keeps_segments:
-            values = plan.all_extended(i, inputs.parameters, stacked[i][0])
         elif stacked[i] is not None:
-            # There may be rows that complete a block.
-            number = len(output.held)
-            values = jtu.tree_map(lambda x, n=number: x[:n], stacked[i][0])
+            values = stacked[i][0]
         final = partial(output.fn, plan.steps.time(now.n), now.state[0], args)
         states.append(_assemble(plan, output, save, now, ys, values, final))
     return _final_state(plan, now, plan.structure.unflatten(states)), trace
@@ -493,30 +345,20 @@ def _walk(plan: Plan, records: PyTree) -> tuple[Now, PyTree]:
     steps, solver, system = plan.steps, plan.solver, plan.system
     init, meter = plan.rest["init_state"], plan.rest["progress_meter"]
 
-    def extended(equal: bool, now: Now, extend: bool = True) -> tuple[Now, PyTree]:
-        """A step, and its continuous extension."""
+    def step(equal: bool, now: Now) -> Now:
         span = plan.span(now.n)
         if equal:
             # What depends on the length alone is computed before the loop.
             span = span._replace(h=plan.length)
         fitted = solver.fitted(system, span.t1, span.h, now.state[0])
-        extension, infos, segment = plan.extension, now.dense, None
-        if extension is None or not extend:
-            y, carry, result = solver.attempt(fitted, *span, *now.state)
-        else:
-            args = extension, fitted, span, *now.state
-            y, carry, result, record = solver.recorded(*args)
-            segment = extension.segment(system, span, now.state[0], record)
+        infos = now.dense
+        y, carry, result = solver.attempt(fitted, *span, *now.state)
         end = y, carry
         if infos is not None:
             info = solver.dense_info(system, span, now.state, end)
             infos = _set(infos, now.n, info, True)
         done = (steps.time(now.n + 1) - steps.t0) / (steps.t1 - steps.t0)
-        now = Now(now.n + 1, end, result, meter.step(now.meter, done), infos)
-        return now, segment
-
-    def step(equal: bool, now: Now) -> Now:
-        return extended(equal, now, extend=False)[0]
+        return Now(now.n + 1, end, result, meter.step(now.meter, done), infos)
 
     zero, meters = jnp.asarray(0), init.progress_meter_state
     now = Now(zero, plan.start, None, meters, init.dense_infos)
@@ -525,18 +367,11 @@ def _walk(plan: Plan, records: PyTree) -> tuple[Now, PyTree]:
         now = now._replace(result=jtu.tree_map(jnp.asarray, dfx.RESULTS.successful))
     well = lambda now: now.result == dfx.RESULTS.successful
 
-    def there(well: Array, new: Now, old: Now) -> Now:
-        """The former where a solve has not failed before."""
-        dense = new.dense  # without a selection, as nothing is read after the failure
-        new, old = (x._replace(dense=None) for x in (new, old))
-        select = lambda x, y: jnp.where(well, x, y)
-        return jtu.tree_map(select, new, old)._replace(dense=dense)
-
     def advance(equal: bool, stop: Array, now: Now) -> Now:
         left = lambda now: stop - now.n
         return repeat(left, partial(step, equal), now, well if can_fail else None)
 
-    is_record = lambda x: isinstance(x, _Stack | _Every | _Extended)
+    is_record = lambda x: isinstance(x, _Stack | _Every)
     flat, structure = jtu.tree_flatten(records, is_leaf=is_record)
     states = [record.start() for record in flat]
     # The loop stops for nothing else, so that each stop is one of the record's.
@@ -555,24 +390,11 @@ def _walk(plan: Plan, records: PyTree) -> tuple[Now, PyTree]:
         at = reduce(jnp.minimum, wanted)
         now = step(equal, now) if each else advance(equal, at, now)
         hits = [alone or w == at for w in wanted]
-        new, segment, triples = now, None, list(zip(flat, states, hits, strict=True))
-        inside = [
-            hit & record.inside(state)
-            for record, state, hit in triples
-            if isinstance(record, _Extended)
-        ]
-        if inside and plan.extension is not None:
-            take = partial(extended, equal)
-            leave = lambda now: (now, plan.no_segment())
-            new, segment = lax.cond(reduce(jnp.logical_or, inside), take, leave, now)
-            if can_fail:
-                new = there(now.n == at, new, now)
-        # What is saved is that at the start of this step. A solve that has failed is
-        # not there, and what is saved of it is dropped at the end: in a batch all stop
-        # at the same steps, and no row is selected.
+        # What is saved of a solve that has failed is dropped at the end: in a batch all
+        # stop at the same steps, and no row is selected.
         now = now._replace(n=at)
-        saved = [record.save(now, *rest, segment) for record, *rest in triples]
-        return new, saved
+        triples = zip(flat, states, hits, strict=True)
+        return now, [record.save(now, *rest) for record, *rest in triples]
 
     def more(last: Array, x):
         return reduce(jnp.minimum, due(x[1])) <= last
@@ -650,7 +472,8 @@ def _final_state(plan: Plan, now: Now, save_state):
     # The first of its numbers counts the steps.
     count, *rest = jtu.tree_leaves(init.controller_state)
     structure = jtu.tree_structure(init.controller_state)
-    controller = jtu.tree_unflatten(structure, [count + n, *rest])
+    count = count + jnp.asarray(n, jnp.result_type(count))
+    controller = jtu.tree_unflatten(structure, [count, *rest])
     state = eqx.tree_at(lambda state: state.controller_state, state, controller)
     if plan.rest["saveat"].dense:
         index = jnp.arange(len(init.dense_ts))

@@ -16,8 +16,8 @@ from ._split import AbstractSplit, State
 
 
 _T = TypeVar("_T")
-# Also the result where the energy is not defined. Older versions of Optimistix lack it.
-NONFINITE: Any = getattr(dfx.RESULTS, "nonfinite", dfx.RESULTS.nonlinear_divergence)
+# Also the result where the energy is not defined.
+NONFINITE: Any = dfx.RESULTS.nonfinite  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class System(eqx.Module):

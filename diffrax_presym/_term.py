@@ -7,22 +7,6 @@ from ._split import State
 from ._system import check_state, System
 
 
-# Methods of Hamiltonians written for earlier versions, and what to write instead.
-_SPLITS = (
-    "Write the property `splits`: `(KineticSplit(separable=..., nystrom=...),)` if the "
-    "flow of the kinetic part is known, and `()` otherwise."
-)
-_RENAMED = {
-    "drift": "Write `kinetic_flow(t, h, q, p, args, order)`, which returns the changes "
-    "of `q` and, beyond friction, of `p`. Friction comes from `damping` alone.",
-    "is_separable": _SPLITS,
-    "is_split": _SPLITS,
-    "is_quadratic": _SPLITS,
-    "has_quadratic_potential": _SPLITS,
-    "quadratic_kinetic": _SPLITS,
-}
-
-
 class HamiltonianTerm(dfx.AbstractTerm):
     r"""The equations of motion of a Hamiltonian, for `diffrax.diffeqsolve`.
 
@@ -67,12 +51,6 @@ class HamiltonianTerm(dfx.AbstractTerm):
                 "potential))`, or `HamiltonianTerm(Hamiltonian(energy))` for a "
                 "function `energy(t, q, p, args)`."
             )
-        for name, instead in _RENAMED.items():
-            if hasattr(type(hamiltonian), name):
-                raise ValueError(
-                    f"`{type(hamiltonian).__name__}.{name}` is no longer used. "
-                    f"{instead}"
-                )
         self.hamiltonian = hamiltonian
 
     def vf(self, t, y: State, args: PyTree) -> State:

@@ -99,10 +99,9 @@ FINDER = optx.Newton(rtol=1e-12, atol=1e-12)
 # advance for the implicit scheme.
 SCHEMES = {
     "Coupled, 4": (lambda scale: dps.PresymplecticCoupled(4, scale=scale), 11),
-    "Projected, 4": (lambda _: dps.PresymplecticProjected(4), 11),
     "Coupled, 2": (lambda scale: dps.PresymplecticCoupled(2, scale=scale), 3),
     "Tao": (lambda _: dps.PresymplecticTao(), 3),
-    "Midpoint, implicit": (lambda _: dps.PresymplecticMidpoint(FINDER), None),
+    "Midpoint, implicit": (lambda _: dps.PresymplecticGauss(1, FINDER), None),
 }
 
 

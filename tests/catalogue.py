@@ -384,6 +384,7 @@ class Friction:
     eta: Callable = lambda t: 0.0
     external: Callable | None = None
     needs: str = ""  # "mass", "stiffness" or "bodies"
+    double: bool = False  # whether it is made for double precision
     constant: bool = True  # in time
     smooth: bool = True  # whether its rate has a derivative that is known
     # From rest at a singularity: the order that is left, and the limit of the force and
@@ -633,6 +634,7 @@ FRICTION = [
         _some(lambda s: [dps.ViscousDamping(_operator(s))]),
         *(_by_matrix, "matrix"),
         needs="mass",
+        double=True,
     ),
     Friction("place", _same(dps.PositionDamping(_place_rate)), _by_place, "place"),
     Friction(
@@ -789,11 +791,8 @@ SCHEMES = [
         composable=False,
     ),
     Scheme(
-        *("projected 4", lambda: dps.PresymplecticProjected(4), 4, None),
-        symmetric=False,
-        composable=False,
+        "midpoint", lambda find: dps.PresymplecticGauss(1, find), 2, None, implicit=True
     ),
-    Scheme("midpoint", dps.PresymplecticMidpoint, 2, None, implicit=True),
     Scheme("Gauss 2", lambda: dps.PresymplecticGauss(2), 4, None),
     Scheme("Gauss 4", lambda: dps.PresymplecticGauss(4), 8, None),
     Scheme(
@@ -1188,8 +1187,7 @@ ELSEWHERE = {
     *("ArclengthDensity", "DistanceDensity", "StepDensityController"),  # step_density
     *("ChosenStep", "HamiltonianTerm", "HermiteInterpolation"),
     *("FixedStepAdjoint", "ReversibleAdjoint"),  # GRADIENTS
-    *("ExponentialScaling", "Scaling", "MirrorMap", "PNormMirror"),  # bregman
-    *("HyperbolicMirror", "LogBarrierMirror"),
+    *("ExponentialScaling", "Scaling", "MirrorMap"),  # bregman
     *("KineticSplit", "PotentialSplit", "SharedSplit"),  # of systems above
     *("Splitting", "SplittingTableau"),  # tableaus
     *("Hamiltonian", "SeparableHamiltonian"),  # as systems without friction

@@ -104,7 +104,7 @@ IMPLICIT = [
     Scheme("leapfrog_AB", dps.PresymplecticLeapfrog("momentum", _finder), 2, 1),
     Scheme("leapfrog_BA", dps.PresymplecticLeapfrog("position", _finder), 2, 1),
     Scheme("suzuki_yoshida_4_BA", dps.PresymplecticYoshida4("position", _finder), 4, 3),
-    Scheme("midpoint", dps.PresymplecticMidpoint(_finder), 2, 1),
+    Scheme("midpoint", dps.PresymplecticGauss(1, _finder), 2, 1),
 ]
 
 

@@ -491,13 +491,6 @@ def test_what_is_not_supported_names_what_is(wrong, what):
         wrong()
 
 
-def test_schemes_that_cannot_be_reversed_have_another_adjoint():
-    projected = dps.PresymplecticProjected()
-    with pytest.raises(ValueError, match=r"Projected.*FixedStepAdjoint"):
-        solve(INPUTS, REVERSIBLE, projected)
-    check(solver=projected, system=nonseparable, adjoints=(FIXED_STEP,))
-
-
 def test_gradients_by_checkpoints_need_max_steps():
     with pytest.raises(ValueError, match="max_steps"):
         value_and_gradient(INPUTS, FIXED_STEP, dict(max_steps=None))

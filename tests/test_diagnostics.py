@@ -77,8 +77,3 @@ def test_convergence_order(solver, order):
     assert abs(measured - order) < 0.2
     with pytest.raises(ValueError, match="steps"):
         diagnostics.convergence_order(DRIVEN, solver, 1.0, 3.0, Y0, 0, 0.7)
-
-
-def test_only_copies_have_a_distance():
-    with pytest.raises(ValueError, match="keeps no copies"):
-        diagnostics.copy_distance(dps.PresymplecticLeapfrog(), Y0, None)

@@ -224,27 +224,3 @@ def test_relativistic_kinetic_energy_does_not_overflow(p, mass):
 
 
 # Friction that is written in the wrong place.
-
-
-def test_friction_in_a_drift_alone_is_refused():
-    class Old(dps.AbstractHamiltonian):
-        damping = None
-        splits = (dps.KineticSplit(separable=True, nystrom=True),)
-
-        def energy(self, t, q, p, args=None):
-            return jnp.sum(p**2 + q**2) / 2
-
-        def velocity(self, t, q, p, args=None):
-            return p
-
-        def force(self, t, q, p, args=None):
-            return -q
-
-        def kinetic_flow(self, t, h, q, p, args=None, order=8):
-            return h * p, None
-
-        def drift(self, t, h, q, p, args=None, order=8):
-            return q + h * p, jnp.exp(-h) * p
-
-    with pytest.raises(ValueError, match="Friction comes from `damping` alone"):
-        dps.HamiltonianTerm(Old())  # pyright: ignore[reportCallIssue]

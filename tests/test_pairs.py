@@ -49,6 +49,8 @@ def possible(row: dict) -> bool:
         return False
     if way is not None and way.backwards and friction.limit is not None:
         return False
+    if row.get("precision") == "float32" and friction.double:
+        return False
     return "gradient" not in row or way.own == row["gradient"].own
 
 

@@ -32,10 +32,7 @@ class _Saved(NamedTuple):
 
     number: Array
     step: Callable[[Array], Array]  # the step from whose start each is computed
-    # Pulls back one of them, or all up to it that are computed from the same step.
-    pull: Callable[[Position, Array], tuple[PyTree, PyTree]]
-    # The number of those that are left then.
-    before: Callable[[Array], Array]
+    pull: Callable[[Position, Array], tuple[PyTree, PyTree]]  # of one of them
 
 
 class Backward:
@@ -76,11 +73,8 @@ class Backward:
             if output.every:
                 self.saved.append(self._every(i))
             if len(output.held):
-                starts, before = self.trace.starts[i], lambda j: j
+                starts = self.trace.starts[i]
                 pull = partial(self._pull_time, i)
-                if plan.extension is not None:
-                    pull = partial(self._pull_times, i)
-                    before = lambda j, output=output: output.before[j]
                 if starts is not None:
                     more, rows = self._pull_all(i, starts)
                     gradient = tree_sum(gradient, more)
@@ -90,7 +84,7 @@ class Backward:
                     )
                 begin = jnp.where(output.empty, 0, output.start)
                 step = lambda j, begin=begin: begin[j]
-                self.saved.append(_Saved(output.times(n), step, pull, before))
+                self.saved.append(_Saved(output.times(n), step, pull))
         return Position(n, state, bar, gradient, [x.number for x in self.saved])
 
     def start(self, at: Position) -> Position:
@@ -131,7 +125,7 @@ class Backward:
                     at, saved.pull(at, left[k] - 1)
                 )
                 at = lax.cond(hit, pull, lambda at: at, at)
-                left[k] = jnp.where(hit, saved.before(left[k] - 1), left[k])
+                left[k] = jnp.where(hit, left[k] - 1, left[k])
                 at = at._replace(left=left)
             return at
 
@@ -165,7 +159,7 @@ class Backward:
             bar = self._row(i, output.row_of_step(step(j)), True)
             return self._pull_state(i, at.n, at.state, bar)
 
-        return _Saved(self.trace.n // output.every, step, pull, lambda j: j)
+        return _Saved(self.trace.n // output.every, step, pull)
 
     def _row(self, i: int, row: Array, pred) -> PyTree:
         """The cotangent of one row of an output, or zero."""
@@ -195,44 +189,6 @@ class Backward:
 
         bar = self._row(i, plan.outputs[i].rows_of_times()[j], True)
         return jax.vjp(output, self.moved, at.state)[1](bar)
-
-    def _pull_times(self, i: int, at: Position, j: Array):
-        """Pull back all outputs up to one of them that are saved in the same step."""
-        plan, output = self.plan, self.plan.outputs[i]
-        rows = output.rows_of_times()
-
-        def segment(moved, start):
-            system, _ = eqx.combine(moved, self.fixed)
-            return plan.segment(system, at.n, start)
-
-        def value(k: Array, moved, segment, y):
-            system, fns = eqx.combine(moved, self.fixed)
-            t = output.ts[k]
-            if segment is not None:
-                y = plan.extended(system, at.n, segment, y, t, output.inside[k])
-            return eqx.filter(fns[i](t, y, system.args), eqx.is_inexact_array)
-
-        def all_values(segment):
-            inputs = self.moved, segment, at.state[0]
-
-            def add(k: Array, bars):
-                pull = jax.vjp(partial(value, k), *inputs)[1]
-                return tree_sum(bars, pull(self._row(i, rows[k], True)))
-
-            zeros = jtu.tree_map(jnp.zeros_like, inputs)
-            return lax.fori_loop(output.before[j], j + 1, add, zeros)
-
-        def at_start():
-            more, _, y_bar = all_values(None)
-            return more, (y_bar, jtu.tree_map(jnp.zeros_like, at.state[1]))
-
-        def inside():
-            within, pull = jax.vjp(segment, self.moved, at.state)
-            more, bar, y_bar = all_values(within)
-            gradient, (y, carry) = pull(bar)
-            return tree_sum(more, gradient), (tree_sum(y, y_bar), carry)
-
-        return lax.cond(output.inside[j], inside, at_start)
 
     def _pull_all(self, i: int, starts: PyTree):
         """Pull back all outputs between steps."""

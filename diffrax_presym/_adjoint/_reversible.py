@@ -29,8 +29,7 @@ class ReversibleAdjoint(AbstractFixedStepAdjoint):
     or without gradients, the fast loop for steps that are known beforehand.
 
     Saved times cost little, and between steps the solution has the full order of the
-    scheme: it is a shorter step of the scheme itself or, where forces take long, its
-    continuous extension.
+    scheme: it is a shorter step of the scheme itself.
 
     The gradient is that of the discrete solution ("discretise, then optimise"). It
     agrees with that of [`diffrax_presym.FixedStepAdjoint`][] to rounding, and costs two

@@ -19,10 +19,7 @@ from ._mirror import (
     AbstractMirrorMap as AbstractMirrorMap,
     EntropyMirror as EntropyMirror,
     EuclideanMirror as EuclideanMirror,
-    HyperbolicMirror as HyperbolicMirror,
-    LogBarrierMirror as LogBarrierMirror,
     MirrorMap as MirrorMap,
-    PNormMirror as PNormMirror,
 )
 from ._pairwise import pairwise_potential as pairwise_potential
 from ._potential import QuadraticPotential as QuadraticPotential

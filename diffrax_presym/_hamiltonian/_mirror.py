@@ -6,15 +6,11 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
-from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Bool, PyTree
+from jaxtyping import Array, Bool, PyTree
 
 from .._friction._base import Scalar
 from .._misc import (
     all_finite,
-    as_parameter,
-    as_positive,
-    cast_to,
     check_root_finder,
     match,
     scalar_fn,
@@ -166,135 +162,6 @@ class EntropyMirror(AbstractMirrorMap):
         return jtu.tree_map(lambda p: p - jnp.mean(p, axis=-1, keepdims=True), p)
 
 
-class PNormMirror(AbstractMirrorMap):
-    r"""The squared norm $h(q) = \tfrac12 \|q\|_s^2$ of the whole state, $1 < s \le 2$.
-
-    Between the geometry of [`diffrax_presym.EuclideanMirror`][], $s = 2$, and one that
-    favours sparse solutions, $s \to 1$. The Hessian is infinite where an entry is zero,
-    unless $s = 2$. Use a splitting: all other schemes need the Hessian.
-    """
-
-    exponent: Scalar
-
-    def __init__(self, exponent):
-        """**Arguments:**
-
-        - `exponent`: the exponent $s$, more than 1 and at most 2.
-
-        **Raises:**
-
-        `ValueError` if the exponent is known to be outside of that range.
-        """
-        name = "`PNormMirror(exponent)`"
-        self.exponent = as_parameter(exponent, name)
-        known = not isinstance(self.exponent, Tracer)
-        if known and not bool(jnp.all((self.exponent > 1) & (self.exponent <= 2))):
-            raise ValueError(
-                f"{name} must be more than 1 and at most 2, but got {exponent}. For a "
-                "quadratic form write `EuclideanMirror(mass)`."
-            )
-
-    def __call__(self, q: PyTree) -> Scalar:
-        return tree_dot(q, self.gradient(q)) / 2
-
-    def gradient(self, q: PyTree) -> PyTree:
-        return _norm_gradient(q, self.exponent)
-
-    def inverse(self, w: PyTree) -> PyTree:
-        return _norm_gradient(w, self.exponent / (self.exponent - 1))
-
-
-def _norm_gradient(x: PyTree, s: Scalar) -> PyTree:
-    """The gradient of half the squared `s`-norm; zero with zero derivatives at zero."""
-    power = lambda a, s: jnp.where(a > 0, jnp.where(a > 0, a, 1) ** cast_to(s, a), 0)
-    largest = jtu.tree_reduce(
-        jnp.maximum, jtu.tree_map(lambda x: jnp.max(jnp.abs(x), initial=0), x)
-    )
-    # In units of the largest entry, so that powers neither overflow nor vanish. The
-    # result does not depend on the unit, so it need not be differentiated.
-    unit = jax.lax.stop_gradient(jnp.where(largest > 0, largest, 1))
-    scaled = jtu.tree_map(lambda x: x / cast_to(unit, x), x)
-    powers = jtu.tree_map(lambda x: jnp.sum(power(jnp.abs(x), s)), scaled)
-    norm = power(jtu.tree_reduce(jnp.add, powers), 1 / s)
-    factor = unit * power(norm, 2 - s)
-
-    def leaf(x):
-        return cast_to(factor, x) * jnp.sign(x) * power(jnp.abs(x), s - 1)
-
-    return jtu.tree_map(leaf, scaled)
-
-
-class LogBarrierMirror(AbstractMirrorMap):
-    r"""The logarithmic barrier $h(q) = -\sum_i \log q_i$, for positive numbers.
-
-    The geometry of Burg's entropy. Mirror images are negative; a solve fails where
-    $\nabla h(q) + p$ is not.
-    """
-
-    def __call__(self, q: PyTree) -> Scalar:
-        return -tree_dot(*_ones_and(jtu.tree_map(jnp.log, q)))
-
-    def gradient(self, q: PyTree) -> PyTree:
-        return jtu.tree_map(lambda q: -1 / q, q)
-
-    def inverse(self, w: PyTree) -> PyTree:
-        return jtu.tree_map(lambda w: jnp.where(w < 0, -1 / w, jnp.nan), w)
-
-    def contains(self, q: PyTree) -> Bool[Array, ""]:
-        return _everywhere(lambda qi: (qi > 0) & jnp.isfinite(qi), q)
-
-    def step(self, q: PyTree, p: PyTree) -> PyTree:
-        leaf = lambda q, p: jnp.where(q * p < 1, q * q * p / (1 - q * p), jnp.nan)
-        return jtu.tree_map(leaf, q, p)
-
-    def change(self, q: PyTree, dq: PyTree) -> PyTree:
-        return jtu.tree_map(lambda q, dq: dq / q / (q + dq), q, dq)
-
-
-class HyperbolicMirror(AbstractMirrorMap):
-    r"""The hyperbolic entropy
-    $h(q) = \sum_i q_i \sinh^{-1}(q_i / s) - \sqrt{q_i^2 + s^2}$.
-
-    Entropic for numbers large compared to the scale $s$, and Euclidean for small ones;
-    defined for both signs. A smooth alternative to [`diffrax_presym.PNormMirror`][].
-    """
-
-    scale: Scalar
-
-    def __init__(self, scale: ArrayLike = 1.0):
-        """**Arguments:**
-
-        - `scale`: the scale $s$, a positive number in units of `q`. Defaults to 1.
-
-        **Raises:**
-
-        `ValueError` if the scale is known not to be positive.
-        """
-        self.scale = as_positive(scale, "`HyperbolicMirror(scale)`")
-
-    def _root(self, q):
-        return jnp.hypot(q, cast_to(self.scale, q))
-
-    def __call__(self, q: PyTree) -> Scalar:
-        inner = tree_dot(q, self.gradient(q))
-        return inner - tree_dot(*_ones_and(jtu.tree_map(self._root, q)))
-
-    def gradient(self, q: PyTree) -> PyTree:
-        return jtu.tree_map(lambda q: jnp.arcsinh(q / cast_to(self.scale, q)), q)
-
-    def inverse(self, w: PyTree) -> PyTree:
-        return jtu.tree_map(lambda w: cast_to(self.scale, w) * jnp.sinh(w), w)
-
-    def contains(self, q: PyTree) -> Bool[Array, ""]:
-        return all_finite(q)
-
-    def step(self, q: PyTree, p: PyTree) -> PyTree:
-        def leaf(q, p):
-            return 2 * q * jnp.sinh(p / 2) ** 2 + self._root(q) * jnp.sinh(p)
-
-        return jtu.tree_map(leaf, q, p)
-
-
 class MirrorMap(AbstractMirrorMap):
     r"""A mirror map given by a function $h$.
 
@@ -392,7 +259,3 @@ class MirrorMap(AbstractMirrorMap):
 def _everywhere(condition: Callable, q: PyTree) -> Bool[Array, ""]:
     held = jtu.tree_map(lambda qi: jnp.all(condition(qi)), q)
     return jtu.tree_reduce(jnp.logical_and, held, jnp.array(True))
-
-
-def _ones_and(x: PyTree) -> tuple[PyTree, PyTree]:
-    return jtu.tree_map(jnp.ones_like, x), x

@@ -13,12 +13,10 @@ from ._composition import (
 )
 from ._coupled import (
     PresymplecticCoupled as PresymplecticCoupled,
-    PresymplecticProjected as PresymplecticProjected,
 )
 from ._euler import PresymplecticEuler as PresymplecticEuler
 from ._gauss import PresymplecticGauss as PresymplecticGauss
 from ._leapfrog import PresymplecticLeapfrog as PresymplecticLeapfrog
-from ._midpoint import PresymplecticMidpoint as PresymplecticMidpoint
 from ._multistep import SymmetricMultistep as SymmetricMultistep
 from ._splitting import (
     BlanesCasasRKN8 as BlanesCasasRKN8,

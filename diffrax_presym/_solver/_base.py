@@ -1,12 +1,10 @@
 import abc
 import bisect
-from collections.abc import Callable
 from functools import partial
 from typing import ClassVar, Generic, NamedTuple, TYPE_CHECKING, TypeVar
 
 import diffrax as dfx
 import equinox as eqx
-import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -30,7 +28,6 @@ from ._engine import (
     time_lengths,
 )
 from ._estimate import no_error_estimate
-from ._extension import AbstractExtension
 
 
 if TYPE_CHECKING:
@@ -129,13 +126,6 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
             "not. Compose `PresymplecticLeapfrog()` instead."
         )
 
-    def distance(self, y: State, solver_state: _Carry) -> Array:
-        """The largest difference between the copies of the system, if any."""
-        raise ValueError(
-            f"`{type(self).__name__}` keeps no copies of the system, so there is no "
-            "distance between them. Use `PresymplecticCoupled()`, for example."
-        )
-
     def lengths(self, system: System) -> np.ndarray:
         """The lengths of the stages over which friction acts, in units of the step."""
         return time_lengths(self.moves(system))
@@ -188,45 +178,6 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         """One step, with a failure if its end is invalid."""
         y, carry, result = self.advance(system, t0, t1, h, y, carry)
         return y, carry, first_failure(result, system.check(t1, y))
-
-    def extension(self, system: System, t: Array, y: State) -> AbstractExtension | None:
-        """The continuous extension of the scheme, if there is one that pays."""
-        return None
-
-    # What a wrapper keeps of a scheme is part of its own solver state.
-
-    def inner_carry(self, carry: _Carry) -> PyTree:
-        """The solver state of the scheme within all wrappers."""
-        return carry
-
-    def with_inner_carry(self, carry: _Carry, inner: PyTree) -> _Carry:
-        """The solver state with that of the scheme within all wrappers replaced."""
-        return inner
-
-    def recorded(
-        self,
-        extension: AbstractExtension,
-        system: System,
-        span: Span,
-        y: State,
-        carry: _Carry,
-    ) -> tuple[State, _Carry, Result, PyTree]:
-        """As `attempt`, and what the extension needs of the step."""
-        inner = extension.recording(y, self.inner_carry(carry))
-        start = self.with_inner_carry(carry, inner)
-        y, end, result = self.attempt(system, *span, y, start)
-        inner, record = extension.recorded(y, self.inner_carry(end))
-        return y, self.with_inner_carry(end, inner), result, record
-
-    def within(
-        self,
-        system: System,
-        span: Span,
-        start: tuple[State, _Carry],
-        end: tuple[State, _Carry],
-    ) -> Callable[[Array], State] | None:
-        """The solution within a step, if the end of the step tells enough of it."""
-        return None
 
     def between(
         self, system: System, t0: Array, start: tuple[State, _Carry], t: Array
@@ -292,16 +243,12 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver[_Carry], Generic[_Carry]):
         if number == 0:
             return info
 
-        within = self.within(system, span, start, end)
-        state = within or partial(self.between, system, t0, start)
-
         def at(fraction):
             t = t0 + fraction * h
-            y = state(t)
+            y = self.between(system, t0, start, t)
             return y, tree_scale(h, system.slope(t, y))
 
-        each = lax.map if within is None else lambda f, x: jax.vmap(f)(x)
-        return info | dict(inner=each(at, cast_to(inner_points(number), h)))
+        return info | dict(inner=lax.map(at, cast_to(inner_points(number), h)))
 
     def func(self, terms, t0, y0, args):
         return terms.vf(t0, y0, args)
@@ -361,17 +308,8 @@ class AbstractWrapper(AbstractMoveSolver[_Carry], Generic[_Carry]):
     def undoable(self, start: PyTree, end: PyTree) -> Array | None:
         return self.base.undoable(start, end)
 
-    def inner_carry(self, carry: _Carry) -> PyTree:
-        return self.base.inner_carry(carry)
-
-    def with_inner_carry(self, carry: _Carry, inner: PyTree) -> _Carry:
-        return self.base.with_inner_carry(carry, inner)
-
     def composition_error(self) -> str | None:
         return self.base.composition_error() or super().composition_error()
-
-    def distance(self, y: State, solver_state: PyTree) -> Array:
-        return self.base.distance(y, solver_state)
 
 
 class AdjointMethod(AbstractWrapper[_Carry], Generic[_Carry]):

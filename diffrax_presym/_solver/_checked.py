@@ -1,10 +1,8 @@
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
-from .._split import State
 from .._system import System
 from ._base import AbstractPresymplecticSolver, AbstractWrapper
-from ._engine import Moves, Span, Stages
-from ._extension import AbstractExtension
+from ._engine import Moves, Stages
 from ._moves import check_finite
 
 
@@ -14,8 +12,7 @@ class Checked(AbstractWrapper[PyTree]):
     Order, cost per step and dense/ts output are those of the base. A potential that
     returns `nan`, a force that overflows, or a step beyond the limit of stability ends
     the solve with `RESULTS.nonfinite`, an error unless `throw=False`, instead of
-    continuing with `nan`. With older versions of Optimistix the result is
-    `nonlinear_divergence`.
+    continuing with `nan`.
 
     It is not the default because it has a cost where a step takes a few nanoseconds.
     Around [`diffrax_presym.Substeps`][] it checks once per `n` steps.
@@ -33,12 +30,6 @@ class Checked(AbstractWrapper[PyTree]):
         `ValueError` if it is not one.
         """
         self.base = base
-
-    def extension(self, system: System, t: Array, y: State) -> AbstractExtension | None:
-        return self.base.extension(system, t, y)
-
-    def within(self, system: System, span: Span, start, end):
-        return self.base.within(system, span, start, end)
 
     def moves(self, system: System) -> Moves:
         moves = self.base.moves(system), check_finite

@@ -6,8 +6,7 @@ from .._misc import as_positive, cast_to, Sum
 from .._split import State
 from .._system import System
 from ._base import AbstractPresymplecticSolver, AbstractWrapper
-from ._engine import Moves, Span, Stages
-from ._extension import AbstractExtension
+from ._engine import Moves, Stages
 from ._moves import to_sums
 
 
@@ -80,25 +79,8 @@ class Compensated(AbstractWrapper[PyTree]):
         moves = to_sums, self.base.moves(system), to_sums.inverse
         return Stages(moves, [(0, 0, 0), (0, 1, 1), (1, 1, 0)])
 
-    def extension(self, system: System, t: Array, y: State) -> AbstractExtension | None:
-        return self.base.extension(system, t, y)
-
-    def within(self, system: System, span: Span, start, end):
-        of_base = [(y, carry[0]) for y, carry in (start, end)]
-        return self.base.within(system, span, *of_base)
-
-    def inner_carry(self, carry: PyTree) -> PyTree:
-        return self.base.inner_carry(carry[0])
-
-    def with_inner_carry(self, carry: PyTree, inner: PyTree) -> PyTree:
-        return self.base.with_inner_carry(carry[0], inner), carry[1]
-
     def undoable(self, start: PyTree, end: PyTree) -> Array | None:
         return self.base.undoable(start[0], end[0])
 
     def slope(self, system: System, t: Array, y: State, carry: PyTree) -> State:
         return self.base.slope(system, t, y, carry[0])
-
-    def distance(self, y: State, solver_state: PyTree) -> Array:
-        carry, lost = solver_state
-        return self.base.distance(jtu.tree_map(Sum, y, lost), carry)

@@ -5,13 +5,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
-from .._misc import as_parameter, as_positive, cast_to, largest
+from .._misc import as_parameter, as_positive, cast_to
 from .._split import State
 from .._system import System
-from ._base import AbstractMoveSolver, AbstractPresymplecticSolver
+from ._base import AbstractMoveSolver
 from ._composition import rows
 from ._copies import exchange, move_frames, rotate, separate
-from ._engine import forward, Moves, Result, Span, Stages
+from ._engine import Moves, Stages
 from ._tableaus import (
     SOFRONIOU_SPALETTA_6,
     SOFRONIOU_SPALETTA_8,
@@ -123,83 +123,3 @@ class PresymplecticCoupled(AbstractMoveSolver[State]):
             "`PresymplecticCoupled` composes its own stages, and rotates its copies "
             "only at the ends of a step. Write `PresymplecticCoupled(order)`."
         )
-
-    def distance(self, y: State, solver_state: State) -> Array:
-        """The largest difference between the copies, in any entry of `q` or `p`.
-
-        **Arguments:**
-
-        - `y`: the state at the end of a solve; not used.
-        - `solver_state`: the solver state there, from
-            `SaveAt(t1=True, solver_state=True)`.
-        """
-        return 2 * largest(solver_state)
-
-
-class PresymplecticProjected(AbstractPresymplecticSolver[None]):
-    r"""Two copies of the system, both set to their mean after each composed step.
-
-    Order 2, 4, 6, 8 or 10 as given; 3, 11, 27, 43 or 71 evaluations of velocity and
-    force per step. Explicit for every Hamiltonian. Not symmetric, and symplectic up to
-    an error of higher order, which matters over very long times. Uses Hermite
-    interpolation for dense/ts output, at the cost of up to three more steps.
-
-    For Hamiltonians that are neither separable nor split, over moderate times. As
-    accurate as [`diffrax_presym.PresymplecticCoupled`][] at the same cost, and without
-    a solver state.
-
-    ??? cite "Reference"
-
-        ```bibtex
-        @article{pihajoki2015explicit,
-            author={Pihajoki, Pauli},
-            title={Explicit methods in extended phase space for inseparable
-                   {H}amiltonian problems},
-            journal={Celestial Mechanics and Dynamical Astronomy},
-            volume={121},
-            number={3},
-            pages={211--231},
-            year={2015},
-        }
-
-        @article{luo2017explicit,
-            author={Luo, Junjie and Wu, Xin and Huang, Guoqing and Liu, Fuyao},
-            title={Explicit symplectic-like integrators with midpoint permutations for
-                   spinning compact binaries},
-            journal={The Astrophysical Journal},
-            volume={834},
-            number={1},
-            pages={64},
-            year={2017},
-        }
-        ```
-    """
-
-    composed_order: int = eqx.field(static=True)
-
-    def __init__(self, order: int = 2):
-        """**Arguments:**
-
-        - `order`: the order, 2, 4, 6, 8 or 10. Defaults to 2.
-
-        **Raises:**
-
-        `ValueError` if the order is not one of these.
-        """
-        self.composed_order = _check_order(order, "PresymplecticProjected")
-
-    @property
-    def is_symmetric(self) -> bool:
-        return False
-
-    def order(self, terms) -> int:
-        return self.composed_order
-
-    def advance(
-        self, system: System, t0: Array, t1: Array, h: Array, y: State, carry: None
-    ) -> tuple[State, None, Result]:
-        # The difference of the copies is dropped, so the step is not invertible.
-        moves = _free_step(self.composed_order, lambda h, half: half)
-        stage = y, system.zeros(y)
-        (y, _), result = forward(moves, system, Span(t0, t1, h), stage)
-        return y, None, result

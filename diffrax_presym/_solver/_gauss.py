@@ -1,4 +1,3 @@
-from collections.abc import Callable
 from typing import NamedTuple
 
 import diffrax as dfx
@@ -10,14 +9,10 @@ import optimistix as optx
 from jaxtyping import Array, Inexact
 
 from .._misc import cast_to, check_root_finder, is_sum, rounding_errors, Sum
-from .._scan import cheap_iterations
 from .._split import State
 from .._system import System
 from ._base import AbstractPresymplecticSolver
 from ._collocation import gauss_table, MAX_STAGES
-from ._engine import Span
-from ._extension import pays
-from ._gauss_extension import GaussExtension
 from ._gauss_step import (
     by_root_finder,
     contract,
@@ -28,13 +23,6 @@ from ._gauss_step import (
     Slopes,
 )
 from ._moves import root_find
-
-
-# The number of iterations that a step mostly takes.
-_USUAL = 8
-# Numbers in a state from which the extension is faster, whatever its forces cost: the
-# other arithmetic of iterations takes longer than cheap forces. As measured.
-_MANY = 16
 
 
 class _Carry(NamedTuple):
@@ -208,34 +196,6 @@ class PresymplecticGauss(AbstractPresymplecticSolver[_Carry]):
         # The solution depends on none of it, except by rounding.
         carry = _Carry(rounding_errors(sums), slopes, cast_to(h, carry.h))
         return y, lax.stop_gradient(carry), result
-
-    def extension(self, system: System, t: Array, y: State) -> GaussExtension | None:
-        # Where fixed-point iteration need not converge, it is not used either.
-        if self.root_finder is not None:
-            return None
-        extension = GaussExtension(self.stages)
-        numbers = _USUAL * self.stages, extension.evaluations
-        many = sum(jnp.size(x) for x in jtu.tree_leaves(y)) >= _MANY
-        if many and cheap_iterations():
-            return extension
-        return extension if pays(*numbers, system.velocity_and_force, t, y) else None
-
-    def within(
-        self,
-        system: System,
-        span: Span,
-        start: tuple[State, _Carry],
-        end: tuple[State, _Carry],
-    ) -> Callable[[Array], State] | None:
-        if self.root_finder is not None:
-            return None
-        extension, y = GaussExtension(self.stages), system.values(start[0])
-        table = gauss_table(self.stages)
-        step = GaussStep(system, table, span.t0, span.h, y, system.zeros(y))
-        # Backwards in time the solver state has the slopes of another step.
-        slopes, _ = self._solve(step, end[1].slopes)
-        segment = extension.segment(system, span, y, (end[0], slopes))
-        return lambda t: extension.at(system, span, segment, t)
 
     def _solve(self, step: "GaussStep", guess: Slopes) -> tuple[Slopes, dfx.RESULTS]:
         if self.root_finder is None:

@@ -1,17 +1,15 @@
 """The moves of schemes with one copy of the system.
 
 The state within a step is a pair: the variables of a split or `(q, p)`, and the force
-of the last kick, or `None` if the scheme does not reuse it, or the `Forces` of all.
+of the last kick, or `None` if the scheme does not reuse it.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import diffrax as dfx
-import jax.lax as lax
 import jax.tree_util as jtu
 import optimistix as optx
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 from .._misc import all_finite, rounding_errors, Sum, tree_scale, tree_sub
 from .._split import AbstractSplit, State
@@ -50,32 +48,6 @@ def drift(kind: str, order: int) -> Move:
     return Move(move, move)
 
 
-class Forces(NamedTuple):
-    """The forces of the kicks of a step, in their order."""
-
-    number: Array
-    rows: PyTree  # so many of them, stacked
-    # The next one, apart from these: otherwise XLA would compute it twice, to store it
-    # and to kick.
-    last: PyTree
-
-    def push(self, force: PyTree) -> "Forces":
-        return Forces(self.number + 1, self.complete, force)
-
-    @property
-    def complete(self) -> PyTree:
-        """All of them, stacked."""
-        put = lambda xs, x: lax.dynamic_update_index_in_dim(xs, x, self.number, 0)
-        return jtu.tree_map(put, self.rows, self.last)
-
-
-def _kept(carry: PyTree, force: PyTree) -> PyTree:
-    """What is kept of the force of a kick, in place of that of the last one."""
-    if isinstance(carry, Forces):
-        return carry.push(force)
-    return None if carry is None else force
-
-
 def _kicked(system: System, span: Span, stage: Stage, force: PyTree) -> Outcome:
     (first, second), carry = stage
     z = first, system.add(second, span.h, force)
@@ -97,13 +69,12 @@ def kick(kind: str, order: int, known: bool = False) -> Move:
 
     def same(system: System, span: Span, stage: Stage) -> Outcome:
         z, carry = stage
-        force = carry.last if isinstance(carry, Forces) else carry
-        return (by(force, system, span, z), carry), None
+        return (by(carry, system, span, z), carry), None
 
     def move(system: System, span: Span, stage: Stage) -> Outcome:
         z, carry = stage
         force = _split(system, kind).force(system, span.t0, z)
-        return (by(force, system, span, z), _kept(carry, force)), None
+        return (by(force, system, span, z), None if carry is None else force), None
 
     return Move(same if known else move, move)
 

@@ -1,6 +1,6 @@
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import equinox.internal as eqxi
@@ -28,11 +28,8 @@ from ._base import AbstractMoveSolver, AbstractPresymplecticSolver, AdjointMetho
 from ._engine import Move, Moves, Span, Stage
 from ._multistep_tables import (
     check_rho,
-    HERMITE,
     multistep_table,
-    MultistepInterpolation,
     MultistepTable,
-    QUINTIC,
     RHO,
 )
 from ._splitting import BlanesCasasRKN8
@@ -64,11 +61,9 @@ class _Carry(NamedTuple):
 class SymmetricMultistep(AbstractMoveSolver[_Carry]):
     r"""A symmetric multistep method: high order with one force evaluation per step.
 
-    8th, 10th or 12th order. One force evaluation per step. Uses Hermite interpolation
-    for dense/ts output, 7th order in positions and 5th in momenta, at the cost of the
-    force and its derivative along the flow at both ends. With
-    [`diffrax_presym.ReversibleAdjoint`][] an output between two steps is a step of the
-    eighth-order scheme below, of 19 evaluations.
+    8th, 10th or 12th order. One force evaluation per step. An output between two steps
+    is a step of the eighth-order scheme below, of 19 evaluations: in the loop of
+    Diffrax, dense/ts output takes five or seven of them in each step.
 
     For a kinetic energy $\tfrac12 \, p \cdot M^{-1} p$ with constant mass, any
     potential and any scalar friction, with constant steps, at errors of 1e-6 and less:
@@ -124,7 +119,6 @@ class SymmetricMultistep(AbstractMoveSolver[_Carry]):
     """
 
     rho: tuple[float, ...] = eqx.field(static=True)
-    interpolation_cls: ClassVar = MultistepInterpolation
 
     def __init__(self, order: int = 8, rho: Sequence[float] | None = None):
         r"""**Arguments:**
@@ -220,10 +214,6 @@ class SymmetricMultistep(AbstractMoveSolver[_Carry]):
         # A shorter step is always one of the one-step scheme.
         h = self.step_length(t0, t)
         return _ONE_STEP.advance(system, t0, t, h, start[0], None)[0]
-
-    def dense_info(self, system: System, span: Span, start, end) -> dict[str, PyTree]:
-        step = _Step(system, self.split(system), self.table, span)
-        return step.dense_info(start[0], end[0])
 
 
 class _Step:
@@ -356,44 +346,6 @@ class _Step:
         z = values(q), tree_add(values(momentum), h, gained)
         return self.split.from_split(self.system, t, z)[1]
 
-    def dense_info(self, y0: State, y1: State) -> dict[str, PyTree]:
-        system, (t0, t1, h) = self.system, self.span
-        mean = tree_scale(1 / h, self._times_mass(tree_sub(y1[0], y0[0])))
-        slope0, slope1 = system.slope(t0, y0)[1], system.slope(t1, y1)[1]
-        friction = system.friction
-        singular = None if friction is None else friction.is_singular(t0)
-        # There is no second derivative at a singularity of the friction.
-        regular = (t0, y0) if singular is None else _pick(singular, (t1, y1), (t0, y0))
-
-        def second(t, y):
-            along = jnp.ones_like(t), system.slope(t, y)
-            return jax.jvp(system.slope, (t, y), along)[1][1]
-
-        def leaf(p1, slope1, second1, p0, slope0, second0, mean):
-            step = cast_to(h, p0)
-            first = p1, step * slope1, step**2 * second1, p0, step * slope0
-            jet = step**2 * second0
-            if singular is not None:
-                # Instead, the polynomial is of one degree less.
-                *weights, unknown, of_mean = HERMITE[-1].tolist()
-                rest = sum(c * x for c, x in zip(weights, first, strict=True))
-                jet = jnp.where(singular, -(rest + of_mean * mean) / unknown, jet)
-            return jnp.stack([*first, jet, mean])
-
-        rows = jtu.tree_map(
-            leaf,
-            *(y1[1], slope1, second(t1, y1)),
-            *(y0[1], slope0, second(*regular)),
-            mean,
-        )
-        # Momenta without the mean, in which differences of positions are amplified.
-        p = jtu.tree_map(lambda x: _product(QUINTIC, x[:-1]), rows)
-        integrals = HERMITE / np.arange(1, 8)[:, None]
-        velocity = jax.vmap(lambda p: system.velocity(t1, (y1[0], p)))
-        dq = velocity(jtu.tree_map(lambda x: _product(integrals, x), rows))
-        dq = tree_scale(h, dq)
-        return dict(y0=y0, y1=y1, coefficients=(dq, p))
-
 
 def _pick(condition: Bool[Array, ""], x: PyTree, y: PyTree) -> PyTree:
     return jtu.tree_map(partial(jnp.where, condition), x, y)
@@ -401,11 +353,6 @@ def _pick(condition: Bool[Array, ""], x: PyTree, y: PyTree) -> PyTree:
 
 def _outer(column: np.ndarray, x: Array) -> Array:
     return cast_to(column, x).reshape(-1, *(1,) * x.ndim) * x[None]
-
-
-def _product(matrix: np.ndarray, rows: Array) -> Array:
-    columns = cast_to(matrix, rows)
-    return jnp.tensordot(columns, rows, 1, precision=lax.Precision.HIGHEST)
 
 
 def _stack(sums: tuple[PyTree[Sum], ...]) -> PyTree:

@@ -1,5 +1,4 @@
-"""Tables of symmetric multistep methods, computed from their roots, and their dense
-output."""
+"""Tables of symmetric multistep methods, computed from their roots."""
 
 import functools
 import math
@@ -7,12 +6,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import NamedTuple
 
-import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, PyTree
-
-from .._interpolation import AbstractStepInterpolation
-from .._misc import cast_to
 
 
 # The coefficients of rho up to the middle one. They determine the method, as sigma
@@ -168,43 +162,3 @@ def _solve(matrix, right) -> list[list[Fraction]]:
                     x - factor * y for x, y in zip(rows[r], rows[i], strict=True)
                 ]
     return [row[size:] for row in rows]
-
-
-def _hermite(size: int) -> np.ndarray:
-    """From the momentum and its first two derivatives, at the end and at the start of a
-    step, and perhaps its mean, to its polynomial in the fraction of the step."""
-    powers = np.arange(size)
-    start, end = np.eye(size)[:3], np.ones((3, size))
-    start[2] *= 2
-    end[1], end[2] = powers, powers * (powers - 1)
-    rows = np.concatenate([end, start, 1 / (powers + 1)[None]])
-    return np.linalg.inv(rows[:size])
-
-
-HERMITE, QUINTIC = _hermite(7), _hermite(6)
-
-
-class MultistepInterpolation(AbstractStepInterpolation):
-    """Hermite interpolation from a position and three derivatives at both ends, and
-    from a momentum and two derivatives.
-
-    Exact at both ends, with errors of eighth and sixth order in the length of the step.
-    """
-
-    t0: PyTree
-    t1: PyTree
-    y0: PyTree
-    y1: PyTree
-    # The coefficients of the change of the position and of the momentum, stacked.
-    coefficients: PyTree
-
-    def at_fraction(self, s: Array) -> PyTree:
-        (q, _), (dq, p) = self.y0, self.coefficients
-
-        def leaf(coefficients):
-            # Horner's rule.
-            x = cast_to(s, coefficients)
-            return functools.reduce(lambda y, c: y * x + c, coefficients[::-1])
-
-        scaled = lambda dq: cast_to(s, dq) * leaf(dq)
-        return jtu.tree_map(lambda q, dq: q + scaled(dq), q, dq), jtu.tree_map(leaf, p)

@@ -10,9 +10,7 @@ from .._system import System
 from ._base import AbstractMoveSolver
 from ._composition import rows
 from ._engine import Moves, Stages
-from ._extension import pays
 from ._moves import drift, kick, to_split
-from ._splitting_extension import number_of_points, SplittingExtension
 from ._tableaus import (
     BLANES_CASAS_RKN_8,
     BLANES_MOAN_4,
@@ -111,18 +109,6 @@ class AbstractSplitting(AbstractMoveSolver[PyTree]):
             moves = enter, stages, flow, enter.inverse
             spans = [(0, 0, 0), (0, 1, 1), drifts[-1], (1, 1, 0)]
         return Stages(moves, spans)
-
-    def extension(
-        self, system: System, t: Array, y: State
-    ) -> SplittingExtension | None:
-        # Of other systems the drifts are not multiples of the velocity.
-        known = system.split("shared") is not None and self.kind != "shared"
-        numbers = len(self.tableau.fractions[1::2]), number_of_points(self.tableau)
-        if not known or numbers[0] <= numbers[1]:
-            return None
-        if not pays(*numbers, system.potential_force, t, y):
-            return None
-        return SplittingExtension(self.tableau)
 
     def slope(self, system: System, t: Array, y: State, carry: PyTree) -> State:
         # Otherwise a kick is by a part of the force only.

@@ -2,7 +2,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
 
-from .._misc import as_positive, cast_to, largest, tree_sub
+from .._misc import as_positive, cast_to
 from .._split import State
 from .._system import System
 from ._base import AbstractMoveSolver
@@ -102,18 +102,6 @@ class PresymplecticTao(AbstractMoveSolver[_Carry]):
             "`PresymplecticTao(coupling)` with a few times the highest frequency of "
             "the system, or `PresymplecticCoupled(order)`, which needs none."
         )
-
-    def distance(self, y: State, solver_state: _Carry) -> Array:
-        """The largest difference between the copies, in any entry of `q` or `p`.
-
-        **Arguments:**
-
-        - `y`: the state at the end of a solve.
-        - `solver_state`: the solver state there, from
-            `SaveAt(t1=True, solver_state=True)`.
-        """
-        copy, _ = solver_state
-        return largest(tree_sub(y, copy))
 
     def _angle(self, h: Array) -> Array:
         if self.coupling is None:

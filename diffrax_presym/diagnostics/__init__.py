@@ -3,7 +3,6 @@
 from ._measures import (
     canonical_energy as canonical_energy,
     convergence_order as convergence_order,
-    copy_distance as copy_distance,
     energy as energy,
     energy_error as energy_error,
     energy_lost as energy_lost,

@@ -296,28 +296,3 @@ def convergence_order(
 def _end(term, solver, t0, t1, dt0, y0, args):
     sol = dfx.diffeqsolve(term, solver, t0, t1, dt0, y0, args, max_steps=None)
     return ravel_pytree(jtu.tree_map(lambda y: y[-1], sol.ys))[0]
-
-
-def copy_distance(solver, y: State, solver_state) -> Inexact[Array, ""]:
-    """The largest difference between the two copies of the system that a scheme for
-    nonseparable Hamiltonians keeps.
-
-    It should stay of the size of the error. If the copies drift apart, steps are too
-    large, or the coupling is too weak or in resonance with the step.
-
-    **Arguments:**
-
-    - `solver`: the solver, for example [`diffrax_presym.PresymplecticCoupled`][].
-    - `y`: the state at the end of a solve.
-    - `solver_state`: the solver state there, from `SaveAt(t1=True, solver_state=True)`.
-
-    **Raises:**
-
-    `ValueError` if the solver keeps no copies.
-    """
-    if not hasattr(solver, "distance"):
-        raise ValueError(
-            f"`{type(solver).__name__}` is not a solver of this package, and keeps no "
-            "copies of the system. Use `PresymplecticCoupled()`, for example."
-        )
-    return solver.distance(y, solver_state)
