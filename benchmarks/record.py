@@ -32,7 +32,7 @@ def cases():
             for system in catalogue.SYSTEMS:
                 if isinstance(
                     catalogue.claim(system, friction, scheme), catalogue.Refused
-                ) or catalogue.fails(friction, scheme, catalogue.WRAPPERS[0]):
+                ) or catalogue.fails(system, friction, scheme, catalogue.WRAPPERS[0]):
                     continue
                 new = {(scheme, friction), (scheme, system)} - seen
                 if new:

@@ -1,54 +1,22 @@
 """Presymplectic integrators for Diffrax."""
 
-from . import diagnostics as diagnostics
-from ._adjoint import (
-    FixedStepAdjoint as FixedStepAdjoint,
-    ReversibleAdjoint as ReversibleAdjoint,
-)
+from . import diagnostics as diagnostics, extend as extend
 from ._friction import (
-    AbstractDamping as AbstractDamping,
-    AbstractFriction as AbstractFriction,
     ConstantDamping as ConstantDamping,
     Drag as Drag,
     LogDamping as LogDamping,
-    MixedDamping as MixedDamping,
     PositionDamping as PositionDamping,
+    PowerDamping as PowerDamping,
     RayleighDamping as RayleighDamping,
     ViscousDamping as ViscousDamping,
 )
-from ._hamiltonian import (
-    AbstractHamiltonian as AbstractHamiltonian,
-    AbstractKinetic as AbstractKinetic,
-    AbstractMirrorMap as AbstractMirrorMap,
-    AbstractScaling as AbstractScaling,
-    BregmanHamiltonian as BregmanHamiltonian,
-    ConformalHamiltonian as ConformalHamiltonian,
-    DissipativeHamiltonian as DissipativeHamiltonian,
-    EntropyMirror as EntropyMirror,
-    EuclideanMirror as EuclideanMirror,
-    ExponentialScaling as ExponentialScaling,
-    Hamiltonian as Hamiltonian,
-    LagrangianSystem as LagrangianSystem,
-    MechanicalSystem as MechanicalSystem,
-    MirrorMap as MirrorMap,
-    pairwise_potential as pairwise_potential,
-    PolynomialScaling as PolynomialScaling,
-    QuadraticKinetic as QuadraticKinetic,
-    QuadraticPotential as QuadraticPotential,
-    RelativisticKinetic as RelativisticKinetic,
-    Scaling as Scaling,
-    SeparableHamiltonian as SeparableHamiltonian,
-    VectorField as VectorField,
-)
-from ._interpolation import HermiteInterpolation as HermiteInterpolation
-from ._solver import (
-    AbstractPresymplecticSolver as AbstractPresymplecticSolver,
+from ._loop import FixedStepAdjoint as FixedStepAdjoint
+from ._scheme import (
     BlanesCasasRKN8 as BlanesCasasRKN8,
     BlanesMoan4 as BlanesMoan4,
     BlanesMoan6 as BlanesMoan6,
     BlanesMoanRKN4 as BlanesMoanRKN4,
     BlanesMoanRKN6 as BlanesMoanRKN6,
-    Checked as Checked,
     Compensated as Compensated,
     Composition as Composition,
     PresymplecticCoupled as PresymplecticCoupled,
@@ -70,22 +38,32 @@ from ._solver import (
     TunedLinear8 as TunedLinear8,
     TunedRKN6 as TunedRKN6,
 )
-from ._split import (
-    AbstractSplit as AbstractSplit,
-    KineticSplit as KineticSplit,
-    PotentialSplit as PotentialSplit,
-    SharedSplit as SharedSplit,
-)
 from ._step_size import (
     ArclengthDensity as ArclengthDensity,
     choose_step as choose_step,
     ChosenStep as ChosenStep,
     DistanceDensity as DistanceDensity,
-    pair_distances as pair_distances,
-    power_grid as power_grid,
     StepDensityController as StepDensityController,
 )
-from ._term import HamiltonianTerm as HamiltonianTerm
+from ._system import (
+    BregmanHamiltonian as BregmanHamiltonian,
+    ConformalHamiltonian as ConformalHamiltonian,
+    CustomScaling as CustomScaling,
+    DissipativeHamiltonian as DissipativeHamiltonian,
+    EntropyMirror as EntropyMirror,
+    EuclideanMirror as EuclideanMirror,
+    ExponentialScaling as ExponentialScaling,
+    ForceField as ForceField,
+    Hamiltonian as Hamiltonian,
+    LagrangianSystem as LagrangianSystem,
+    MechanicalSystem as MechanicalSystem,
+    MirrorMap as MirrorMap,
+    pairwise_potential as pairwise_potential,
+    PolynomialScaling as PolynomialScaling,
+    QuadraticKinetic as QuadraticKinetic,
+    QuadraticPotential as QuadraticPotential,
+    RelativisticKinetic as RelativisticKinetic,
+)
 
 
 __version__ = "0.1.0"

@@ -4,13 +4,11 @@ All are symmetric, so only the first half is listed, including the middle. All k
 digits are kept, more than a float holds.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.lax as lax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, ArrayLike
 
 from ._misc import cast_to
 
@@ -95,18 +93,22 @@ SOFRONIOU_SPALETTA_10 = CompositionTableau(
 )
 
 
-def composed(
-    order: int, step: Callable[[Array, Array, PyTree], PyTree], h: Array, state: PyTree
-) -> PyTree:
-    """A symmetric map of order two, composed to at least the given order.
+_KNOWN = SUZUKI_4, SOFRONIOU_SPALETTA_6, SOFRONIOU_SPALETTA_8, SOFRONIOU_SPALETTA_10
 
-    `step(t, h, state)` is over a time `h` from the time `t` after the start.
-    """
-    if order <= 2:
-        return step(jnp.zeros_like(h), h, state)
-    known = SUZUKI_4, SOFRONIOU_SPALETTA_6, SOFRONIOU_SPALETTA_8, SOFRONIOU_SPALETTA_10
-    tableau = next(x for x in known if x.order >= order or x is known[-1])
-    weights = np.array(tableau.weights)
-    starts = np.cumsum(weights) - weights
-    spans = cast_to(starts, h) * h, cast_to(weights, h) * h
-    return lax.scan(lambda x, span: (step(*span, x), None), state, spans)[0]
+
+def stages(weights: Sequence[float]) -> np.ndarray:
+    """Start, end and length of consecutive stages, in units of the whole."""
+    ends = np.cumsum(weights)
+    ends[-1] = 1
+    starts = np.concatenate([[0], ends[:-1]])
+    return np.stack([starts, ends, weights], axis=-1)
+
+
+def spans(order: int, h: ArrayLike) -> tuple[Array, Array]:
+    """Starts and lengths of the stages of a composition of symmetric maps of order two,
+    of at least the given order, or the highest known."""
+    weights = (1.0,)
+    if order > 2:
+        weights = next((x for x in _KNOWN if x.order >= order), _KNOWN[-1]).weights
+    starts, _, lengths = stages(weights).T
+    return cast_to(starts, h) * h, cast_to(lengths, h) * h

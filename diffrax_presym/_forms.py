@@ -11,7 +11,7 @@ from ._misc import as_finite, as_positive, cast_to
 
 _MASSLESS = (
     " For massless test particles let `p` be the momentum per unit mass: "
-    "`SeparableHamiltonian(QuadraticKinetic(), potential, force=acceleration)`."
+    "`MechanicalSystem(QuadraticKinetic(), ForceField(acceleration))`."
 )
 
 

@@ -1,3 +1,4 @@
+import inspect
 from typing import TypeVar
 
 import equinox as eqx
@@ -7,7 +8,13 @@ import jax.tree_util as jtu
 import numpy as np
 import optimistix as optx
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Bool, Inexact, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Inexact, PyTree, Real
+
+
+Time = Real[ArrayLike, ""]
+Scalar = Inexact[Array, ""]
+# A state: positions and momenta.
+State = tuple[PyTree[Inexact[Array, "..."]], PyTree[Inexact[Array, "..."]]]
 
 
 def as_parameter(x, name: str) -> Inexact[Array, "..."]:
@@ -35,6 +42,25 @@ def as_positive(x, name: str, instead: str = "") -> Inexact[Array, "..."]:
     if not isinstance(x, Tracer) and not np.all(np.asarray(x) > 0):
         raise ValueError(f"{name} must be positive, but got {x}.{instead}")
     return x
+
+
+def check_callable(fn, name: str, signature: str, optional: bool = False) -> None:
+    """An error unless `fn` is a function that takes the arguments of `signature`."""
+    if optional and fn is None:
+        return
+    if not callable(fn):
+        raise ValueError(f"`{name}` must be a function `{signature}`, but got {fn!r}.")
+    try:
+        parameters = inspect.signature(fn)
+    except (TypeError, ValueError):  # of a builtin, say
+        return
+    try:
+        parameters.bind(*signature.split(","))
+    except TypeError:
+        raise ValueError(
+            f"`{name}` must be a function `{signature}`, but got one of the arguments "
+            f"{parameters}."
+        ) from None
 
 
 def cast_to(x: ArrayLike, like: ArrayLike) -> Array:
@@ -87,6 +113,18 @@ def rounding_errors(x: PyTree) -> PyTree:
     return jtu.tree_map(lambda x: x.lost, x, is_leaf=is_sum)
 
 
+def to_sums(y: PyTree, lost: PyTree) -> PyTree:
+    """A state with compensated summation; one that has it already stays as it is."""
+    leaf = lambda x, lost: x if is_sum(x) else Sum(x, lost)
+    return jtu.tree_map(leaf, y, lost, is_leaf=is_sum)
+
+
+def from_sums(sums: PyTree, like: PyTree) -> PyTree:
+    """The inverse of `to_sums`, for a state `like` the one that was given."""
+    leaf = lambda x, new: new if is_sum(x) else new.value
+    return jtu.tree_map(leaf, like, sums, is_leaf=is_sum)
+
+
 def tree_add(y: PyTree, h: ArrayLike, dy: PyTree) -> PyTree:
     """`y + h * dy`, each leaf in its own precision. Leaves of `y` may be `Sum`s."""
     add = lambda di, yi: yi + cast_to(h, di) * di
@@ -94,8 +132,8 @@ def tree_add(y: PyTree, h: ArrayLike, dy: PyTree) -> PyTree:
 
 
 def tree_sum(x: PyTree, y: PyTree) -> PyTree:
-    """`x + y`."""
-    return jtu.tree_map(jnp.add, x, y)
+    """`x + y`. Leaves of `x` may be `Sum`s."""
+    return jtu.tree_map(lambda yi, xi: xi + yi, y, x)
 
 
 def tree_sub(x: PyTree, y: PyTree) -> PyTree:
@@ -108,6 +146,14 @@ def tree_scale(c: ArrayLike | None, y: PyTree) -> PyTree:
     if c is None:
         return y
     return jtu.tree_map(lambda yi: cast_to(c, yi) * yi, y)
+
+
+def tree_zeros(x: PyTree) -> PyTree:
+    return jtu.tree_map(jnp.zeros_like, x)
+
+
+def tree_where(condition: Bool[ArrayLike, ""], x: PyTree, y: PyTree) -> PyTree:
+    return jtu.tree_map(lambda xi, yi: jnp.where(condition, xi, yi), x, y)
 
 
 def tree_dot(x: PyTree, y: PyTree) -> Array:

@@ -45,7 +45,8 @@ class System:
     q: Any
     p: Any
     offers: frozenset[str]  # the splits that it offers without friction
-    takes: str  # the friction that it takes: "all", "rates", "one rate" or "none"
+    # The friction that it takes: "all", "rates", "joints", "one rate" or "none".
+    takes: str
     mass: Any = None
     stiffness: Any = None
     bodies: bool = False  # whether the last axis are the coordinates of bodies
@@ -73,7 +74,7 @@ def _mechanical(kinetic, potential):
 
 def _energy(energy):
     def build(laws, force=None):
-        return dps.MechanicalSystem(energy=energy, friction=laws, force=force)
+        return dps.Hamiltonian(energy, friction=laws, force=force)
 
     return build
 
@@ -82,9 +83,9 @@ def _one_law(make):
     """A class that takes one scalar law, or none, as `damping`."""
 
     def build(laws, force=None):
-        if force is not None or len(laws) > 1:
+        if force is not None:
             raise ValueError("write `MechanicalSystem`")
-        return make(laws[0] if laws else None)
+        return make(list(laws) or None)
 
     return build
 
@@ -204,9 +205,7 @@ def _links_force(t, q, p):
 
 
 def _lagrangian(laws, force=None):
-    if laws:
-        raise ValueError("write `MechanicalSystem`")
-    return dps.LagrangianSystem(_links, _links_potential, force=force)
+    return dps.LagrangianSystem(_links, _links_potential, laws, force=force)
 
 
 def _objective(t, q, args):
@@ -268,7 +267,7 @@ def _relativistic_velocity(t, q, p, eta):
 
 def _dissipative(law):
     eta1 = dps.LogDamping(1.0, shift=2.0)
-    law = dps.ConstantDamping(0.0) if law is None else law
+    law = [dps.ConstantDamping(0.0)] if law is None else law
     return dps.DissipativeHamiltonian(_quadratic(1.5), _driven, eta1, law)
 
 
@@ -276,9 +275,13 @@ def _dissipative_velocity(t, q, p, eta):
     return np.exp(eta) / (t + 2) * p / 1.5
 
 
-def _field(law):
-    force = lambda t, q, args: -jax.grad(_coupled, argnums=1)(t, q, args)
-    return dps.VectorField(lambda t, p, args: p / jnp.sqrt(1 + p**2), force, law)
+def _whirl(t, q, args):
+    """A force without a potential."""
+    return jnp.stack([-q[0] - q[1] / 2, q[0] / 2 - q[1] ** 3])
+
+
+def _whirl_force(t, q, p):
+    return np.array([-q[0] - q[1] / 2, q[0] / 2 - q[1] ** 3])
 
 
 SYSTEMS = [
@@ -336,7 +339,7 @@ SYSTEMS = [
     ),
     System(
         *("M(q)", _lagrangian, _links_velocity, _links_force),
-        *(*_TWO, frozenset(), "none"),
+        *(*_TWO, frozenset(), "joints"),
     ),
     System(
         "conformal",
@@ -364,8 +367,8 @@ SYSTEMS = [
         start=1.0,
     ),
     System(
-        *("vector field", _one_law(_field), _smooth_velocity, _coupled_force),
-        *(*_TWO, SPLIT, "one rate"),
+        *("force field", _mechanical(_quadratic(_MASS), dps.ForceField(_whirl))),
+        *(_inverse(_MASS), _whirl_force, *_TWO, ALL, "all", _MASS),
     ),
 ]
 
@@ -528,7 +531,7 @@ def _from_rest(name, law, gamma, extra=0.0):
         return gamma * np.log(t) + 2 * extra * np.sqrt(t) if t > 0 else -np.inf
 
     return Friction(
-        *(name, _same(law), _rate(lambda t: gamma / t + extra / np.sqrt(t))),
+        *(name, lambda system: law, _rate(lambda t: gamma / t + extra / np.sqrt(t))),
         *("one rate", eta),
         constant=False,
         left=2 if extra else gamma + 1,
@@ -564,9 +567,14 @@ FRICTION = [
         smooth=False,
         kink=_KINK,
     ),
-    _from_rest("3 / t", dps.LogDamping(3.0), 3.0),
-    _from_rest("1.5 / t", dps.LogDamping(1.5), 1.5),
-    _from_rest("3 / t + t^(-1/2) / 5", dps.MixedDamping(3.0, 0.4, 0.5), 3.0, 0.2),
+    _from_rest("3 / t", [dps.LogDamping(3.0)], 3.0),
+    _from_rest("1.5 / t", [dps.LogDamping(1.5)], 1.5),
+    _from_rest(
+        "3 / t + t^(-1/2) / 5",
+        [dps.LogDamping(3.0), dps.PowerDamping(0.4, 0.5)],
+        3.0,
+        0.2,
+    ),
     Friction(
         *("by entry", _some(lambda s: [dps.ConstantDamping(_shaped(s, _rates(s)))])),
         *(lambda s, t, q, p, v: -_rates(s) * p, "entries"),
@@ -658,6 +666,7 @@ FRICTION = [
         "[constant, 2 / (t + 1)]",
         _same(dps.ConstantDamping(0.4), dps.LogDamping(2.0, 1.0)),
         *(_rate(lambda t: 0.4 + 2 / (t + 1)), "one rate"),
+        eta=lambda t: 0.4 * t + 2 * np.log(t + 1),
         constant=False,
     ),
     Friction(
@@ -831,10 +840,7 @@ def _composition(base):
 WRAPPERS = [
     Wrapper("bare", lambda base: base),
     Wrapper("Compensated", dps.Compensated),
-    Wrapper("Checked", dps.Checked),
     Wrapper("Substeps", lambda base: dps.Substeps(base, 2), 2),
-    Wrapper("Checked(Compensated)", lambda base: dps.Checked(dps.Compensated(base))),
-    Wrapper("Compensated(Checked)", lambda base: dps.Compensated(dps.Checked(base))),
     Wrapper(
         *("Substeps(Compensated)", lambda base: dps.Substeps(dps.Compensated(base), 3)),
         steps=3,
@@ -849,8 +855,8 @@ WRAPPERS = [
         *(lambda order: 6, True),
     ),
     Wrapper(
-        "Checked(Composition)",
-        lambda base: dps.Checked(_composition(base)),
+        "Compensated(Composition)",
+        lambda base: dps.Compensated(_composition(base)),
         *(None, lambda order: 4, True, False),
     ),
     Wrapper(
@@ -876,12 +882,13 @@ def offered(system: System, friction: Friction) -> frozenset[str] | Refused:
     kind = friction.kind
     if kind == "none":
         return system.offers
-    if system.takes == "none" and not (kind == "force" and system.name == "M(q)"):
+    if system.takes == "none":
         return Refused("its own friction")
-    if system.takes == "one rate" and (
-        kind != "one rate" or len(friction.laws(system)) > 1
-    ):
+    if system.takes == "one rate" and kind != "one rate":
         return Refused("one rate")
+    if system.takes == "joints":
+        known = friction.needs != "bodies" and friction.name != "Rayleigh"
+        return frozenset() if known else Refused("not of joints")
     if friction.needs == "stiffness" and (
         system.stiffness is None or system.mass is None
     ):
@@ -889,7 +896,7 @@ def offered(system: System, friction: Friction) -> frozenset[str] | Refused:
     if friction.needs and system.mass is None:
         return Refused("no mass")
     if friction.needs == "bodies" and not system.bodies:
-        return Refused("no mass for each body")
+        return frozenset()  # without a closed form, it is a force
     if kind == "force":
         return frozenset()
     if kind in ("place", "drag"):
@@ -914,6 +921,8 @@ def claim(
         order = 4
     if wrapper.composes and order == 2:
         order = wrapper.order(order)
+    if friction.kind == "drag" and system.size == 1:
+        return min(order, 2)  # |v| v has a kink where the body turns
     if friction.limit is None:
         return order
     # From a singularity on: an exact drift of a known mass leaves more than others.
@@ -921,9 +930,11 @@ def claim(
     return min(order, friction.left if exact else 2)
 
 
-def fails(friction: Friction, scheme: Scheme, wrapper: Wrapper) -> bool:
-    """Whether a solve must fail, since stages leave the domain."""
-    return friction.limit is not None and not (scheme.inside and wrapper.inside)
+def fails(system: System, friction: Friction, scheme: Scheme, wrapper: Wrapper) -> bool:
+    """Whether a solve must fail: stages leave the domain, or a force is infinite."""
+    infinite = system.takes == "joints" and friction.needs == "mass"
+    stays = scheme.inside and wrapper.inside and not infinite
+    return friction.limit is not None and not stays
 
 
 # The reference.
@@ -1020,7 +1031,7 @@ class Problem:
     def solve(self, dt0, y0, saveat, **options):
         options = {"t0": self.t0, "t1": self.t1, "args": None} | options
         return dfx.diffeqsolve(
-            dps.HamiltonianTerm(self.system),
+            self.system,
             self.solver,
             **{"dt0": dt0, "y0": y0, "saveat": saveat, "adjoint": self.adjoint},
             **{"max_steps": MAX_STEPS, "throw": False} | options,
@@ -1078,11 +1089,10 @@ def _adaptive(problem, n, y0):
 
 
 def _step_density(problem, n, y0):
-    term = dps.HamiltonianTerm(problem.system)
     density = lambda t, y, args: (
         1 / (1 + 0.2 * sum(jnp.sum(x**2) for x in jax.tree.leaves(y[0])))
     )
-    controller = dps.StepDensityController(term, problem.length(n), density)
+    controller = dps.StepDensityController(problem.system, problem.length(n), density)
     ts = dfx.SaveAt(t1=True)
     sol = problem.solve(None, y0, ts, stepsize_controller=controller)
     return [(sol.ts, sol.ys)], sol.result
@@ -1174,8 +1184,8 @@ class Gradient:
 
 
 GRADIENTS = [
-    Gradient("reversal", dps.ReversibleAdjoint, True),
-    Gradient("checkpoints", dps.FixedStepAdjoint, True),
+    Gradient("reversal", dps.FixedStepAdjoint, True),
+    Gradient("checkpoints", lambda: dps.FixedStepAdjoint("checkpoints"), True),
     Gradient("Diffrax's checkpoints", dfx.RecursiveCheckpointAdjoint, False),
     Gradient("forward mode", dfx.ForwardMode, False),
 ]
@@ -1185,10 +1195,8 @@ PRECISIONS = ["float64", "float32"]
 # What is exported and not combined here, and the file of tests that has it.
 ELSEWHERE = {
     *("ArclengthDensity", "DistanceDensity", "StepDensityController"),  # step_density
-    *("ChosenStep", "HamiltonianTerm", "HermiteInterpolation"),
-    *("FixedStepAdjoint", "ReversibleAdjoint"),  # GRADIENTS
-    *("ExponentialScaling", "Scaling", "MirrorMap"),  # bregman
-    *("KineticSplit", "PotentialSplit", "SharedSplit"),  # of systems above
+    *("ChosenStep", "FixedStepAdjoint"),
+    *("ConformalHamiltonian", "DissipativeHamiltonian"),  # functions, used above
+    *("ExponentialScaling", "CustomScaling", "MirrorMap"),  # bregman
     *("Splitting", "SplittingTableau"),  # tableaus
-    *("Hamiltonian", "SeparableHamiltonian"),  # as systems without friction
 }

@@ -1,70 +1,71 @@
-"""Friction as a linear operator on momenta."""
+"""What every law of friction declares: the parts it adds to the motion."""
 
 import abc
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
-from jaxtyping import Array, ArrayLike, Bool, Inexact, PyTree, Real
+import lineax as lx
+from jaxtyping import Array, Inexact, PyTree
+
+from .._misc import Time
+from ._log_scale import AbstractLogScale
 
 
-Time = Real[ArrayLike, ""]
-Scalar = Inexact[Array, ""]
-# A scalar for the whole system, or arrays for the entries of its momenta.
-Numbers = PyTree[Inexact[Array, "..."]]
+# A number, an array, a matrix, a pytree of these, or an operator; `None` is one.
+Form = PyTree[Inexact[Array, "..."]] | lx.AbstractLinearOperator | None
+
+
+class Mechanics(NamedTuple):
+    """What friction needs to know of a system; `None` if that is not known."""
+
+    mass: Any
+    stiffness: Any = None
+    has_mass: bool = True
+    mass_varies: bool = False  # with the place, so that there are no exact drifts
+
+
+class Linear(NamedTuple):
+    """Friction at a rate that depends on time alone, part of every drift."""
+
+    log_scale: AbstractLogScale
+    form: Form
+    per_velocity: bool = False  # a coefficient, rather than a rate
+
+
+class Local(NamedTuple):
+    """Linear friction that depends on the place, part of every kick."""
+
+    form: Callable  # of t, q, args
+    per_velocity: bool = False
+
+
+class Parts(NamedTuple):
+    """What a law of friction, or several, add to the motion of a system."""
+
+    linear: tuple[Linear, ...] = ()
+    local: tuple[Local, ...] = ()
+    drags: tuple[Any, ...] = ()  # of `Drag`, in the drift
+    local_drags: tuple[Any, ...] = ()  # of `Drag`, in the kick
+    forces: tuple[Any, ...] = ()  # part of the force alone
+
+    def __add__(self, other: "Parts") -> "Parts":  # pyright: ignore
+        return Parts(*(x + y for x, y in zip(self, other, strict=True)))
 
 
 class AbstractFriction(eqx.Module):
-    r"""Linear friction, $p' = F - \Gamma(t) \, p$.
+    """A law of friction, for the argument `friction=` of a system.
 
-    The interface that solvers use. Methods return changes rather than new momenta, so
-    that solvers can add them with compensated summation.
+    Where it acts in a step depends on what it is: linear friction that depends on time
+    alone is part of the drifts, and exact; friction by place is part of the kicks, and
+    drag by speed part of either.
     """
 
     @abc.abstractmethod
-    def decay(self, t: Time, h: Time, p: PyTree) -> PyTree:
-        """The change of `p` from `t` to `t + h` by friction alone."""
+    def parts(self, mechanics: Mechanics) -> Parts:
+        """The parts of the motion that it adds; `ValueError` if it needs to know more
+        of the system."""
 
     @abc.abstractmethod
-    def carry(self, t: Time, h: Time, p: PyTree, order: int) -> PyTree:
-        """The integral of the decaying `p` from `t` to `t + h`.
-
-        Exact if known in closed form, otherwise of the given order in `h`.
-        """
-
-    @abc.abstractmethod
-    def respond(self, t: Time, h: Time, force: PyTree, order: int) -> PyTree:
-        """The momentum gained from `t` to `t + h` under a constant force.
-
-        Exact if known in closed form, otherwise of the given order in `h`.
-        """
-
-    @abc.abstractmethod
-    def net_force(self, t: Time, force: PyTree, p: PyTree) -> PyTree:
-        r"""The force less the friction, $F - \Gamma(t) \, p$."""
-
-    @abc.abstractmethod
-    def amplification(self, t: Time, h: Time, p: PyTree) -> Scalar:
-        """The factor by which errors of `p` grow from `t + h` back to `t`."""
-
-    @abc.abstractmethod
-    def contraction(self, t: Time, h: Time, p: PyTree) -> Scalar:
-        r"""The integral of the trace of $\Gamma$ from `t` to `t + h`.
-
-        Phase volume contracts by the exponential of it. Of `p` only the shapes matter.
-        """
-
-    @abc.abstractmethod
-    def is_singular(self, t: Time) -> Bool[Array, ""] | None:
-        """Whether the friction is infinite at `t`; `None` if it never is."""
-
-    def has_table(self, p: PyTree) -> bool:
-        """Whether `decay`, `carry` and `respond` share what is worth storing. Of `p`
-        only the shapes matter."""
-        return False
-
-    def tabulate(self, p: PyTree, times: Array) -> PyTree:
-        """What these share for times of such lengths, if there is such a thing."""
-        return None
-
-    def with_table(self, table: PyTree) -> "AbstractFriction":
-        """The same friction, which uses the result of `tabulate`."""
-        return self
+    def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
+        """The force of the friction on momenta `p` and velocities `v`."""

@@ -11,10 +11,12 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
 from .._forms import fit_form, is_operator
-from .._misc import as_parameter, cast_to
-from ._base import Numbers, Scalar, Time
-from ._damping import as_numbers
-from ._functions import expm1, expm1_ratio, log1p_ratio
+from .._misc import as_parameter, cast_to, Scalar, Time
+from ._base import AbstractFriction, Mechanics, Parts
+from ._damping import as_numbers, Numbers
+from ._exponential import expm1, expm1_ratio, log1p_ratio
+from ._linear import MASS
+from ._viscous import needs_mass
 
 
 _COEFFICIENT = "`Drag(coefficient)`"
@@ -24,7 +26,7 @@ _FOR_BODIES = (
 )
 
 
-class Drag(eqx.Module):
+class Drag(AbstractFriction):
     r"""Drag $-c \, |v|^{k-1} \, v$ of each body, where $|v|$ is its speed: air drag
     ($k = 2$), Stokes drag ($k = 1$), or any power from 1 on.
 
@@ -35,12 +37,13 @@ class Drag(eqx.Module):
     [`diffrax_presym.Strang`][], [`diffrax_presym.BlanesMoan4`][] and
     [`diffrax_presym.BlanesMoan6`][] keep their order;
     Runge--Kutta--Nyström splittings would not, and refuse it. No structure is kept but
-    the symmetry. In a steady wind, solve in the frame of the air: with velocities
-    relative to the wind $w$, and positions $q - w t$.
+    the symmetry. In a wind or a current, give the velocity $w$ of the `medium`: the
+    drag is then $-c \, |v - w|^{k-1} \, (v - w)$.
 
-    If the coefficient depends on place the drag is part of the kicks. There, and where
-    other friction is added, its flow is a symmetric composition, of the order of the
-    scheme, of flows that are known, without further evaluations of the force.
+    If the coefficient or the medium is a function, the drag is part of the kicks.
+    There, and where other friction is added, its flow is a symmetric composition, of
+    the order of the scheme, of flows that are known, without further evaluations of the
+    force.
 
     Schemes of order above 2 have stages backwards in time, during which drag
     accelerates. A solve fails if the momentum that a body loses over such a stage
@@ -49,8 +52,9 @@ class Drag(eqx.Module):
 
     coefficient: Numbers | Callable
     exponent: Scalar
+    medium: Numbers | Callable | None
 
-    def __init__(self, coefficient, exponent: ArrayLike = 2.0):
+    def __init__(self, coefficient, exponent: ArrayLike = 2.0, medium=None):
         r"""**Arguments:**
 
         - `coefficient`: $c$, in units of force per velocity to the power $k$: a number;
@@ -59,6 +63,9 @@ class Drag(eqx.Module):
             `c(t, q, args)` that returns one of these. Of any sign; negative
             accelerates.
         - `exponent`: the power $k$ of the speed, a number of at least 1. Defaults to 2.
+        - `medium`: the velocity $w$ of the medium: an array that broadcasts to `p`, a
+            pytree of the structure of `p` of these, or a function `w(t, q, args)` that
+            returns one of these. Defaults to `None`, at rest.
 
         **Raises:**
 
@@ -77,50 +84,84 @@ class Drag(eqx.Module):
                 "stops a body in finite time; write it as "
                 "`MechanicalSystem(..., force=f)` and make it smooth at rest."
             )
+        if not callable(medium) and medium is not None:
+            medium = as_numbers(medium, "`Drag(..., medium=...)`")
         self.coefficient = coefficient
         self.exponent = exponent
+        self.medium = medium
 
     @property
     def is_local(self) -> bool:
-        """Whether the coefficient depends on place."""
-        return callable(self.coefficient)
+        """Whether the coefficient or the medium depends on place."""
+        return callable(self.coefficient) or callable(self.medium)
 
-    def of(self, coefficient: Numbers) -> "Drag":
-        """The drag with another coefficient."""
-        return eqx.tree_at(lambda x: x.coefficient, self, coefficient)
+    def parts(self, mechanics: Mechanics) -> Parts:
+        if mechanics.mass_varies:
+            raise ValueError(
+                "`Drag` acts on bodies, not on joints. Write the force that it exerts "
+                "on the joints as `force=f`, with a function `f(t, q, v, args)`."
+            )
+        needs_mass(mechanics, "Drag")
+        return Parts(local_drags=(self,)) if self.is_local else Parts(drags=(self,))
 
-    def force(self, p: PyTree, mass: PyTree) -> PyTree:
-        """The force on momenta `p` of bodies of these masses."""
-        return self._each(p, mass, self._force)
+    def at(self, t: Time, q: PyTree, args: PyTree) -> "Drag":
+        """The drag with the coefficient and the medium at a place."""
+
+        def value(x):
+            return jtu.tree_map(jnp.asarray, x(t, q, args)) if callable(x) else x
+
+        numbers = value(self.coefficient), value(self.medium)
+        where = lambda x: (x.coefficient, x.medium)
+        return eqx.tree_at(where, self, numbers, is_leaf=lambda x: x is None)
+
+    def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
+        drag = self.at(t, q, args)
+
+        def leaf(v: Array, c: Array, w: Array) -> Array:
+            v = v - w
+            return -c * _power_of_speed(v, cast_to(self.exponent, v) - 1) * v
+
+        coefficients = _per_body(drag.coefficient, v, _COEFFICIENT)
+        return jtu.tree_map(leaf, v, coefficients, _of_medium(drag.medium, v))
 
     def flow(self, h: Time, p: PyTree, mass: PyTree) -> tuple[PyTree, PyTree]:
         """The displacements, and the changes of `p`, over a time `h` of motion by drag
         alone."""
-        return self._each(p, mass, lambda *x: self._flow(h, *x), 2)
+        columns = (
+            *(p, _per_body(mass, p, MASS)),
+            _per_body(self.coefficient, p, _COEFFICIENT),
+            _of_medium(self.medium, p),
+        )
+        leaves = zip(*map(jtu.tree_leaves, columns), strict=True)
+        dq, dp = zip(*(self._flow(h, *x) for x in leaves), strict=True)
+        structure = jtu.tree_structure(p)
+        return structure.unflatten(dq), structure.unflatten(dp)
 
-    def _each(self, p: PyTree, mass: PyTree, fn: Callable, outputs: int = 1):
-        leaves, structure = jtu.tree_flatten(p)
-        each = lambda form, name: jtu.tree_leaves(_per_body(form, p, name))
-        coefficients = each(self.coefficient, _COEFFICIENT)
-        masses = each(mass, "`QuadraticKinetic(mass)`")
-        out = [fn(*x) for x in zip(leaves, masses, coefficients, strict=True)]
-        if outputs == 1:
-            return structure.unflatten(out)
-        return tuple(structure.unflatten(x) for x in zip(*out, strict=True))
-
-    def _force(self, p: Array, mass: Array, c: Array) -> Array:
-        v = p / mass
-        return -c * _power_of_speed(v, cast_to(self.exponent, p) - 1) * v
-
-    def _flow(self, h: Time, p: Array, mass: Array, c: Array) -> tuple[Array, Array]:
+    def _flow(
+        self, h: Time, p: Array, mass: Array, c: Array, w: Array
+    ) -> tuple[Array, Array]:
         # The speed decays like (1 + (k - 1) x)^(-1 / (k - 1)), with x the time in units
         # of that in which it would be lost at its initial rate.
-        k, h, v = cast_to(self.exponent, p), cast_to(h, p), p / mass
+        k, h, v = cast_to(self.exponent, p), cast_to(h, p), p / mass - w
         x = c / mass * _power_of_speed(v, k - 1) * h
         ratio = log1p_ratio((k - 1) * x)
         lost = x * ratio  # logarithm of the ratio of the speeds
         distance = ratio * expm1_ratio((k - 2) * lost)
-        return h * distance * v, expm1(-lost) * p
+        return h * (distance * v + w), expm1(-lost) * (mass * v)
+
+
+def _of_medium(medium, p: PyTree) -> PyTree:
+    if medium is None:
+        return jtu.tree_map(lambda x: jnp.zeros((), x.dtype), p)
+    if not jtu.treedef_is_leaf(jtu.tree_structure(medium)):
+        return jtu.tree_map(lambda x, w: cast_to(w, x), p, medium)
+
+    def leaf(x: Array) -> Array:
+        w = cast_to(medium, x)
+        # One velocity for all bodies.
+        return w.reshape((1,) * (x.ndim - w.ndim) + w.shape) if w.ndim else w
+
+    return jtu.tree_map(leaf, p)
 
 
 def _per_body(form, p: PyTree, name: str) -> PyTree:

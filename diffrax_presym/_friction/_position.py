@@ -1,9 +1,14 @@
 from collections.abc import Callable
 
-import equinox as eqx
+from jaxtyping import PyTree
+
+from .._forms import multiply
+from .._misc import Time, tree_scale
+from ._base import AbstractFriction, Local, Mechanics, Parts
+from ._linear import DAMPING
 
 
-class PositionDamping(eqx.Module):
+class PositionDamping(AbstractFriction):
     r"""Friction $-\Gamma(t, q) \, p$ at a rate that depends on place: absorbing layers,
     media, contact with a fluid.
 
@@ -42,3 +47,10 @@ class PositionDamping(eqx.Module):
                 "`ConstantDamping(rate)`."
             )
         self.rate = rate
+
+    def parts(self, mechanics: Mechanics) -> Parts:
+        return Parts(local=(Local(self.rate),))
+
+    def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
+        rate = self.rate(t, q, args)
+        return tree_scale(-1, multiply(rate, p, DAMPING, "p"))

@@ -1,11 +1,12 @@
+"""Convergence of solves with more and more steps, and the fewest that suffice."""
+
 import math
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import diffrax as dfx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
 
 # The error that is aimed at, and that with which the search ends, over the tolerance.
@@ -20,31 +21,58 @@ class Trial(NamedTuple):
     error: float
 
 
-class Solution(NamedTuple):
-    """A solution at the saved times, on the host."""
+class _Trial(NamedTuple):
+    number: int  # of steps that was asked for
+    steps: int  # that were taken
+    error: float
 
-    steps: int
-    # With a leading axis of saved times.
-    leaves: list[np.ndarray]
+
+class Solution(NamedTuple):
+    """What a solve saved, on the host."""
+
+    number: int  # of steps that was asked for
+    steps: int  # that were taken
+    ts: np.ndarray  # all times
+    leaves: list[np.ndarray]  # values, and times
     finite: bool
+    order: int | None  # of the scheme, if that is known
 
     @classmethod
-    def of(cls, steps: int, ys: PyTree, successful) -> "Solution":
-        leaves = [np.asarray(y) for y in jax.tree.leaves(ys)]
-        finite = bool(successful) and all(np.all(np.isfinite(y)) for y in leaves)
-        return cls(steps, leaves, finite)
+    def of(cls, number: int, sol: Any) -> "Solution":
+        if not isinstance(sol, dfx.Solution):
+            raise ValueError(
+                "The solve must return a `diffrax.Solution`, the result of "
+                f"`diffeqsolve`, but returned {type(sol).__name__}."
+            )
+        times = [np.asarray(t, float) for t in jax.tree.leaves(sol.ts)]
+        values = [np.asarray(y) for y in jax.tree.leaves(sol.ys)]
+        good = (dfx.RESULTS.successful, dfx.RESULTS.event_occurred)
+        finite = any(bool(sol.result == x) for x in good)
+        if finite and not all(np.all(np.isfinite(t)) for t in times):
+            raise ValueError(
+                "The solve must save at times that do not depend on the step. Write "
+                "`SaveAt(t1=True)` or `SaveAt(ts=ts)`."
+            )
+        finite = finite and all(np.all(np.isfinite(y)) for y in values)
+        order = sol.stats.get("order")
+        return cls(
+            number,
+            int(sol.stats["num_steps"]),
+            np.concatenate([np.ravel(t) for t in times]) if times else np.zeros(0),
+            [*values, *times],
+            finite,
+            None if order is None else int(order),
+        )
 
 
 def find_steps(
     solve: Callable[[int], Solution],
-    solver: str,
-    order: int,
     tolerances: tuple[float, float],
     grid: int | None,
     max_steps: int,
-) -> tuple[Trial, "Convergence"]:
+) -> tuple[_Trial, "Convergence"]:
     """The smallest number of steps found that reaches the tolerance, and its error."""
-    convergence = Convergence(solver, order, tolerances, max_steps)
+    convergence = Convergence(tolerances, max_steps)
     for n in _numbers(1 if grid is None else grid):
         if n > max_steps:
             raise RuntimeError(convergence.exceeds())
@@ -56,20 +84,18 @@ def find_steps(
 def scaled_error(
     leaves: list[np.ndarray], exact: list[np.ndarray], rtol: float, atol: float
 ) -> float:
-    """The largest error over all times, in the norm of Diffrax, over the tolerance."""
-    squares, count = 0.0, 0
-    for y, y_exact in zip(leaves, exact, strict=True):
-        y_exact = np.asarray(y_exact, float)
-        error = np.abs(np.asarray(y, float) - y_exact)
-        scale = atol + rtol * np.abs(y_exact)
+    """The largest error of an entry, over the tolerance."""
+    worst = 0.0
+    for y, z in zip(leaves, exact, strict=True):
+        z = np.asarray(z, float)
+        error = np.abs(np.asarray(y, float) - z)
+        scale = atol + rtol * np.abs(z)
         # Where both vanish, as for a coordinate at rest, there is no error.
         scaled = np.divide(
             *(error, scale), out=np.where(error > 0, np.inf, 0.0), where=scale > 0
         )
-        with np.errstate(over="ignore"):
-            squares = squares + np.sum(scaled.reshape(len(y), -1) ** 2, axis=1)
-        count += scaled[0].size
-    return float(np.sqrt(np.max(squares) / count))
+        worst = max(worst, float(np.max(scaled, initial=0)))
+    return worst
 
 
 class Convergence:
@@ -78,18 +104,29 @@ class Convergence:
     Of the solutions only the last is kept.
     """
 
-    def __init__(self, solver: str, order, tolerances, max_steps: int):
-        self.solver, self.claimed, self.max_steps = solver, order, max_steps
-        self.tolerances = tolerances
-        self.trials: list[Trial] = []
-        self.order = math.nan
+    def __init__(self, tolerances: tuple[float, float], max_steps: int):
+        self.max_steps, self.tolerances = max_steps, tolerances
+        self.trials: list[_Trial] = []
+        self.order, self.claimed = math.nan, None
         self.finest: Solution | None = None
         self._difference = math.inf
         self._least, self._regular, self._stalls = math.inf, False, 0
+        self._at = 0
+
+    @property
+    def _least_order(self) -> float:
+        return 0.75 if self.claimed is None else max(self.claimed / 2, 0.75)
+
+    @property
+    def highest_order(self) -> float:
+        return 20 if self.claimed is None else 2 * self.claimed + 1
 
     def add(self, solution: Solution) -> bool:
         """Whether the tolerance is reached, by the last solution but one."""
-        coarse, self.finest = self.finest, solution
+        coarse = self.finest
+        if coarse is not None and coarse.steps == solution.steps and coarse.finite:
+            return False  # Steps between given times may be the same.
+        self.finest, self.claimed = solution, solution.order
         if coarse is None:
             return False
         last, self._difference = self._difference, self._distance(coarse, solution)
@@ -98,9 +135,9 @@ class Convergence:
             ratio = coarse.steps / self.trials[-1].steps
             self.order = math.log(last / self._difference) / math.log(ratio)
         error = self.correct(coarse.steps, self._difference)
-        self.trials.append(Trial(coarse.steps, error))
+        self.trials.append(_Trial(coarse.number, coarse.steps, error))
         # An order far above the claim is that of leaving an unstable step behind.
-        regular = max(self.claimed / 2, 0.75) <= self.order <= 2 * self.claimed + 1
+        regular = self._least_order <= self.order <= self.highest_order
         slow = self.order >= 0.75 and before >= 0.75
         # Differences of three solves below the tolerance: of rounding, or exact.
         agree = max(last, self._difference) <= 0.5
@@ -108,23 +145,25 @@ class Convergence:
             if agree and not (regular or slow):
                 self.order = math.nan
             return True
-        if all(0.75 < order / self.claimed < 1.25 for order in (before, self.order)):
+        both = before, self.order
+        if all(x >= 0.75 for x in both) and abs(before / self.order - 1) < 0.25:
             self._check_affordable(coarse.steps, error)
         self._check_rounding(regular or slow, coarse, solution)
         return False
 
-    def measure(self, solution: Solution) -> float:
+    def measure(self, solution: Solution) -> _Trial:
         """The error of another solution, over the tolerance."""
         error = self.correct(solution.steps, self._distance(solution, self.finest))
-        self.trials.append(Trial(solution.steps, error))
-        return error
+        self.trials.append(_Trial(solution.number, solution.steps, error))
+        return self.trials[-1]
 
     def correct(self, steps: int, difference: float) -> float:
         """The error, from the difference to the finest solution."""
         assert self.finest is not None
         known = 0.75 <= self.order < math.inf
-        order = self.order if known else self.claimed
-        return difference / (1 - (steps / self.finest.steps) ** order)
+        order = self.order if known else (self.claimed or 2)
+        left = 1 - (steps / self.finest.steps) ** order
+        return difference / left if left > 0 else difference
 
     def exceeds(self) -> str:
         """The error message where more steps than `max_steps` are needed."""
@@ -133,26 +172,29 @@ class Convergence:
                 f"`choose_step(max_steps={self.max_steps})` is too few steps to find "
                 "an error: at least three solves are needed."
             )
-        steps, error = self.trials[-1]
+        _, steps, error = self.trials[-1]
         if not error < math.inf:
             return (
                 f"`choose_step` found no finite solution with up to {self.max_steps} "
-                "steps. Check that the solution exists up to `t1` and that the force "
-                "is finite along it, or allow more steps: `max_steps=...`."
+                "steps. Check that the solution exists up to `t1`, that the force is "
+                "finite along it, and that the solve allows as many steps "
+                "(`diffeqsolve(..., max_steps=None)`)."
             )
-        if not self.order >= self.claimed / 2:
+        if not self.order >= self._least_order:
+            claimed = "" if self.claimed is None else f" instead of {self.claimed}"
             return (
                 f"`choose_step` found no regular convergence with up to "
                 f"{self.max_steps} steps: with {steps} steps the error is {error:.1e} "
-                f"times the tolerance, and the measured order is {self.order:.1f} "
-                f"instead of {self.claimed}. Check that the force is smooth, and that "
-                "the motion is not chaotic: otherwise use a shorter time span or a "
-                "larger tolerance."
+                f"times the tolerance, and the measured order is {self.order:.1f}"
+                f"{claimed}. Check that the motion is not chaotic, and that the force "
+                "is smooth: if it has kinks at known times, write "
+                "`stepsize_controller=StepsBetween(times)`; otherwise use a shorter "
+                "time span or a larger tolerance."
             )
         return (
             f"`choose_step` needs more than {self.max_steps} steps: with {steps} steps "
             f"the error is {error:.1e} times the tolerance, and the measured order "
-            f"{self.order:.1f}. {self._instead()}"
+            f"{self.order:.1f}. {_INSTEAD}"
         )
 
     def _check_affordable(self, steps: int, error: float):
@@ -161,15 +203,8 @@ class Convergence:
             raise RuntimeError(
                 f"`choose_step` needs about {needed:.1e} steps, but `max_steps` is "
                 f"{self.max_steps}: with {steps} steps the error is {error:.1e} times "
-                f"the tolerance, and the measured order {self.order:.1f}. "
-                f"{self._instead()}"
+                f"the tolerance, and the measured order {self.order:.1f}. {_INSTEAD}"
             )
-
-    def _instead(self):
-        return (
-            "Use a scheme of higher order, for example `TunedRKN6()`, a larger "
-            "tolerance, or allow more steps: `max_steps=...`."
-        )
 
     def _check_rounding(self, converges: bool, coarse: Solution, fine: Solution):
         """An error if solves have stopped converging."""
@@ -179,20 +214,20 @@ class Convergence:
         self._stalls = self._stalls + 1 if self.order < 0.5 else 0
         if self._difference < self._least:
             self._least, self._at = self._difference, coarse.steps
-        eps = max(jnp.finfo(y.dtype).eps for y in fine.leaves)
-        largest = [max(np.max(np.abs(y)), 1e-300) for y in fine.leaves]
+        pairs = [
+            (a, b)
+            for a, b in zip(coarse.leaves, fine.leaves, strict=True)
+            if np.issubdtype(b.dtype, np.floating)
+        ]
+        precision = max((b.dtype for _, b in pairs), key=lambda x: np.finfo(x).eps)
+        eps = float(np.finfo(precision).eps)
         change = max(
-            np.max(np.abs(np.asarray(a, float) - b)) / c
-            for a, b, c in zip(coarse.leaves, fine.leaves, largest, strict=True)
+            float(np.max(np.abs(np.asarray(a, float) - b), initial=0))
+            / max(float(np.max(np.abs(b), initial=0)), 1e-300)
+            for a, b in pairs
         )
         rounding = change < 1e3 * eps or (self._regular and change < eps**0.25)
         if self._stalls >= 2 and rounding:
-            precision = fine.leaves[0].dtype
-            more = (
-                ""
-                if self.solver == "Compensated"
-                else f"`Compensated({self.solver}(...))`, "
-            )
             double = (
                 "double precision (`jax.config.update('jax_enable_x64', True)`), "
                 if precision == np.float32
@@ -201,8 +236,9 @@ class Convergence:
             raise RuntimeError(
                 f"`choose_step` cannot reach this tolerance in {precision}: rounding "
                 f"leaves an error of {self._least:.1e} times the tolerance with "
-                f"{self._at} steps, and more steps do not reduce it. Use {more}"
-                f"{double}or a larger tolerance."
+                f"{self._at} steps, and more steps do not reduce it. Use "
+                f"`adjoint=FixedStepAdjoint()`, whose steps have one length without "
+                f"rounding, `Compensated(solver)`, {double}or a larger tolerance."
             )
 
     def _distance(self, solution: Solution, finest: Solution | None) -> float:
@@ -210,6 +246,12 @@ class Convergence:
         if not (solution.finite and finest.finite):
             return math.inf
         return scaled_error(solution.leaves, finest.leaves, *self.tolerances)
+
+
+_INSTEAD = (
+    "Use a scheme of higher order, for example `TunedRKN6()`, a larger tolerance, or "
+    "allow more steps: `max_steps=...`."
+)
 
 
 def _numbers(grid: int) -> Iterator[int]:
@@ -232,51 +274,51 @@ def _numbers(grid: int) -> Iterator[int]:
 
 def _smallest(
     convergence: Convergence, solve: Callable[[int], Solution], grid: int | None
-) -> Trial:
+) -> _Trial:
     """A smaller number of steps than the last that reaches the tolerance."""
     measure = lambda n: convergence.measure(solve(n))
     *trials, high = convergence.trials
-    low = next((t for t in reversed(trials) if t.error > 1), Trial(0, math.inf))
+    low = next((t for t in reversed(trials) if t.error > 1), _Trial(0, 0, math.inf))
     every = lambda low, high: np.arange(low + 1, high)
-    steepest = 1.5 * convergence.claimed
+    steepest = 1.5 * (convergence.claimed or convergence.highest_order)
     if grid is None:
         return _search(every, low, high, measure, steepest)
-    if high.steps >= grid:
+    if high.number >= grid:
         multiples = lambda low, high: grid * np.arange(low // grid + 1, high // grid)
         return _search(multiples, low, high, measure, steepest)
     best = _search(every, low, high, measure, steepest)
-    for n in range(best.steps, min(2 * best.steps, grid) + 1):
+    for n in range(best.number, min(2 * best.number, grid) + 1):
         if grid % n == 0:
-            error = best.error if n == best.steps else measure(n)
-            if error <= 1:
-                return Trial(n, error)
+            trial = best if n == best.number else measure(n)
+            if trial.error <= 1:
+                return trial
     return best
 
 
 def _search(
     between: Callable[[int, int], np.ndarray],
-    low: Trial,
-    high: Trial,
-    measure: Callable[[int], float],
+    low: _Trial,
+    high: _Trial,
+    measure: Callable[[int], _Trial],
     steepest: float,
-) -> Trial:
+) -> _Trial:
     """A smaller number of steps than `high` that reaches the tolerance."""
     failed = False
     for _ in range(6):
-        numbers = between(low.steps, high.steps)
+        numbers = between(low.number, high.number)
         if high.error >= ENOUGH or not numbers.size:
             break
         # By the law of convergence, between the two on a log scale. Where the larger
         # step is unstable, errors fall faster than that.
         error, slope = max(high.error, 1e-8), steepest
-        if low.steps and low.error < math.inf:
-            slope = math.log(low.error / error) / math.log(high.steps / low.steps)
+        if low.number and low.error < math.inf:
+            slope = math.log(low.error / error) / math.log(high.number / low.number)
             slope = min(slope, steepest)
-        guess = high.steps * (error / AIM) ** (1 / slope)
+        guess = high.number * (error / AIM) ** (1 / slope)
         if failed:  # Not again close to the lower end.
-            guess = max(guess, math.sqrt(low.steps * high.steps))
+            guess = max(guess, math.sqrt(low.number * high.number))
         n = int(numbers[np.argmin(np.abs(numbers - guess))])
-        trial = Trial(n, measure(n))
+        trial = measure(n)
         failed = trial.error > 1
         low, high = (trial, high) if failed else (low, trial)
     return high

@@ -4,11 +4,10 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
-from .._misc import as_parameter, as_positive, cast_to, describe, tree_dot
-from .._term import HamiltonianTerm
+from .._misc import as_positive, cast_to, describe, tree_dot
+from .._system._base import AbstractSystem
 
 
 Scalar = Inexact[Array, ""]
@@ -31,7 +30,7 @@ class DistanceDensity(eqx.Module):
         - `power`: the exponent $s$, a positive number. Defaults to 3/2.
         - `distances`: a function `distances(q)` that returns an array of all relevant
             distances. Defaults to that from the origin, over the last axis of `q`. For
-            bodies that attract each other use [`diffrax_presym.pair_distances`][].
+            bodies that attract each other return those of all pairs.
 
         **Raises:**
 
@@ -50,22 +49,6 @@ def _from_origin(q):
     return jnp.linalg.norm(jnp.atleast_1d(q), axis=-1)
 
 
-def pair_distances(q: Inexact[Array, "bodies space"]) -> Inexact[Array, " pairs"]:
-    """The distances between all pairs of bodies, for
-    [`diffrax_presym.DistanceDensity`][].
-
-    **Arguments:**
-
-    - `q`: the positions, an array of shape `(bodies, space)`.
-
-    **Returns:**
-
-    An array with an entry for each pair.
-    """
-    i, j = jnp.triu_indices(q.shape[0], 1)
-    return jnp.linalg.norm(q[i] - q[j], axis=-1)
-
-
 class ArclengthDensity(eqx.Module):
     r"""The step density of arclength, $\sigma = |(\dot q, \dot p)|^{-1}$.
 
@@ -74,21 +57,21 @@ class ArclengthDensity(eqx.Module):
     force evaluation per step, and its derivative along the motion.
     """
 
-    term: HamiltonianTerm
+    system: AbstractSystem
 
-    def __init__(self, term: HamiltonianTerm):
+    def __init__(self, system: AbstractSystem):
         """**Arguments:**
 
-        - `term`: the term of the solve.
+        - `system`: the system of the solve.
 
         **Raises:**
 
-        `ValueError` if the term is not a [`diffrax_presym.HamiltonianTerm`][].
+        `ValueError` if it is not one of this package.
         """
-        self.term = _as_term(term, "ArclengthDensity")
+        self.system = _as_system(system, "ArclengthDensity")
 
     def __call__(self, t, y, args):
-        slope = self.term.vf(t, y, args)
+        slope = self.system.vf(t, y, args)
         return jax.lax.rsqrt(tree_dot(slope, slope))
 
 
@@ -126,15 +109,15 @@ class StepDensityController(dfx.AbstractStepSizeController):
         ```
     """
 
-    term: HamiltonianTerm
+    system: AbstractSystem
     epsilon: Scalar
     density: Callable
     direction: ArrayLike
 
-    def __init__(self, term: HamiltonianTerm, epsilon: ArrayLike, density: Callable):
+    def __init__(self, system: AbstractSystem, epsilon: ArrayLike, density: Callable):
         r"""**Arguments:**
 
-        - `term`: the term of the solve, for the derivative along the motion.
+        - `system`: the system of the solve, for the derivative along the motion.
         - `epsilon`: the step size $\epsilon$ where the density is one; a positive
             number, in units of time if the density has none.
         - `density`: the step density $\sigma$, a function `density(t, y, args)` that
@@ -143,11 +126,11 @@ class StepDensityController(dfx.AbstractStepSizeController):
 
         **Raises:**
 
-        `ValueError` if `epsilon` is known not to be positive, if the term is not a
-        [`diffrax_presym.HamiltonianTerm`][], and when the solve is traced if `dt0` is
+        `ValueError` if `epsilon` is known not to be positive, if the system is not
+        one of this package, and when the solve is traced if `dt0` is
         given or the density is not a scalar.
         """
-        self.term = _as_term(term, "StepDensityController")
+        self.system = _as_system(system, "StepDensityController")
         self.epsilon = as_positive(epsilon, "`StepDensityController(epsilon=...)`")
         if not callable(density):
             raise ValueError(
@@ -222,55 +205,16 @@ class StepDensityController(dfx.AbstractStepSizeController):
                 )
             return jnp.log(cast_to(sigma, t))
 
-        slope = self.term.vf(self.direction * t, y, args)
+        slope = self.system.vf(self.direction * t, y, args)
         slope = jax.tree.map(lambda dy: cast_to(self.direction, dy) * dy, slope)
         value, rate = jax.jvp(log_density, (t, y), (jnp.ones_like(t), slope))
         return value, -cast_to(self.epsilon, t) * jnp.exp(value) * rate
 
 
-def power_grid(t0: ArrayLike, t1: ArrayLike, steps: int, power: ArrayLike) -> Array:
-    r"""Times $t = \tau^k$ for equal steps in $\tau$, for `diffrax.StepTo`.
-
-    For motion whose frequency is a power of time, such as Bregman dynamics with
-    [`diffrax_presym.PolynomialScaling`][]: there it grows like $t^{c/2-1}$, and the
-    power $k = 2/c$ makes equally many steps per period. Such steps are reversible.
-
-    **Arguments:**
-
-    - `t0`, `t1`: the first and the last time, nonnegative.
-    - `steps`: the number of steps, a positive integer.
-    - `power`: the power $k$, a positive number.
-
-    **Returns:**
-
-    An array of `steps + 1` times.
-
-    **Raises:**
-
-    `ValueError` if the number of steps or the power is not positive, or a time is known
-    to be negative.
-    """
-    if not isinstance(steps, int) or steps < 1:
+def _as_system(system, name: str) -> AbstractSystem:
+    if not isinstance(system, AbstractSystem):
         raise ValueError(
-            f"`power_grid(steps=...)` must be a positive integer, but got {steps!r}."
+            f"`{name}` needs the system of the solve, such as a `MechanicalSystem`, "
+            f"but got {system!r}. Write `{name}(system, ...)`."
         )
-    power = as_positive(power, "`power_grid(power=...)`")
-    t0, t1 = (as_parameter(t, "`power_grid(t0, t1)`") for t in (t0, t1))
-    for t in (t0, t1):
-        if not isinstance(t, Tracer) and t < 0:
-            raise ValueError(
-                f"`power_grid` needs nonnegative times, but got {t}. Powers of "
-                "negative times are not real."
-            )
-    tau = jnp.linspace(t0 ** (1 / power), t1 ** (1 / power), steps + 1)
-    # The exact ends, without rounding.
-    return (tau**power).at[jnp.array([0, -1])].set(jnp.stack([t0, t1]))
-
-
-def _as_term(term, name: str) -> HamiltonianTerm:
-    if not isinstance(term, HamiltonianTerm):
-        raise ValueError(
-            f"`{name}` needs the term of the solve, a `HamiltonianTerm`, but got "
-            f"{term!r}. Write `{name}(term, ...)`."
-        )
-    return term
+    return system

@@ -1,0 +1,1 @@
+from ._adjoint import FixedStepAdjoint as FixedStepAdjoint

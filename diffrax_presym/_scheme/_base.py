@@ -1,0 +1,171 @@
+import abc
+import bisect
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax.lax as lax
+import jax.tree_util as jtu
+from jaxtyping import Array, PyTree
+
+from .._interpolation import HermiteInterpolation, inner_points
+from .._misc import all_finite, cast_to, State, tree_scale
+from .._system._base import check_state
+from .._system._bound import bind, NONFINITE, System
+from ._engine import first_failure, forward, Moves, prepare, Result, Span
+from ._estimate import no_error_estimate
+
+
+# Points within a step that dense output uses, from the order up to which they suffice.
+_ORDERS, _INNER_POINTS = (2, 4, 10, 14), (0, 1, 3, 5, 7)
+
+Point = tuple[State, PyTree]  # a state and the solver state
+
+
+def _nothing(system: System, t: Array, y: State) -> PyTree:
+    return None
+
+
+class Scheme(NamedTuple):
+    """What a solver does with a system."""
+
+    moves: Moves
+    # The initial solver state, of the system, a time and a state.
+    start: Callable[[System, Array, State], PyTree] = _nothing
+    # From the solver state the force that ends a step, if it is known.
+    end_force: Callable[[PyTree], PyTree | None] = lambda carry: None
+    # The state at a time within a step, of the system, the start of the step and the
+    # time; a shorter step if `None`.
+    between: "Callable[[System, Array, Point, Array], State] | None" = None
+    # Whether a step can be inverted from its end; and of the solver states at the start
+    # and at the end of a solve, whether its steps can. `None` if always.
+    is_invertible: bool = True
+    undoable: Callable[[PyTree, PyTree], Array] | None = None
+    # Why steps of unequal length must not be composed: these cancel errors only if the
+    # errors are even in the step size.
+    not_composable: str | None = None
+
+
+class AbstractPresymplecticSolver(dfx.AbstractSolver):
+    """A one-step scheme for a system such as [`diffrax_presym.MechanicalSystem`][].
+
+    A scheme defines its moves; `diffrax.diffeqsolve` handles saving, events, adjoints
+    and the direction of time. No scheme has an error estimate:
+    [`diffrax_presym.choose_step`][] finds the step for a tolerance. For adaptive steps,
+    wrap the scheme in `diffrax.HalfSolver`. A step whose end is not finite makes the
+    solve fail.
+    """
+
+    # Not `AbstractSystem`, so that other terms reach the error message of `bind`.
+    term_structure: ClassVar = dfx.AbstractTerm
+    interpolation_cls: ClassVar = HermiteInterpolation
+
+    @property
+    @abc.abstractmethod
+    def is_symmetric(self) -> bool:
+        """Whether the scheme is its own adjoint method."""
+
+    @abc.abstractmethod
+    def order(self, terms) -> int:
+        """The order of the scheme."""
+
+    @abc.abstractmethod
+    def scheme(self, system: System) -> Scheme:
+        """What the solver does with a system; `ValueError` if it does not support it,
+        or would lose its order."""
+
+    def init(self, terms, t0, t1, y0, args) -> PyTree:
+        check_state(y0)
+        system = bind(terms, args, y0)
+        return self.scheme(system).start(system, system.time(t0), y0)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        system = bind(terms, args, y0)
+        t0, t1 = system.time(t0), system.time(t1)
+        scheme = self.scheme(system)
+        restart = lambda: scheme.start(system, t0, y0)
+        carry = solver_state
+        if carry is None and jtu.tree_leaves(eqx.filter_eval_shape(restart)):
+            raise ValueError(
+                f"`{type(self).__name__}` has a solver state for this system, but got "
+                "`solver_state=None`. Write `solver_state = solver.init(terms, t0, t1, "
+                "y0, args)` before the first step, and pass on the one that each step "
+                "returns."
+            )
+        # After a jump the solver state is stale. Mostly `made_jump` is the Python bool
+        # `False`, and nothing is traced.
+        if made_jump is not False and jtu.tree_leaves(carry):
+            carry = lax.cond(made_jump, restart, lambda: solver_state)
+        span = Span(t0, t1, t1 - t0)
+        start = y0, carry
+        end, result = advance(scheme, system, span, start)
+        finite = dfx.RESULTS.where(
+            all_finite(end[0]), dfx.RESULTS.successful, NONFINITE
+        )
+        info = dense_info(self, scheme, system, span, start, end)
+        result = first_failure(result, finite)
+        return end[0], no_error_estimate(end[0]), info, end[1], result
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+
+def advance(
+    scheme: Scheme, system: System, span: Span, start: Point, data: PyTree = None
+) -> tuple[Point, Result]:
+    """One step; `data` is what was prepared for it, if it was."""
+    if data is None:
+        data = prepare(scheme.moves, system, span)
+    end, result = forward(scheme.moves, system, span, data, start)
+    return end, first_failure(result, system.check(span.t1, system.values(end[0])))
+
+
+def between(
+    scheme: Scheme,
+    system: System,
+    t0: Array,
+    start: Point,
+    t: Array,
+) -> State:
+    """The state at `t` within a step from `t0`, in full order: a shorter step of the
+    scheme from the start of the step, or what the scheme has in its place."""
+    if scheme.between is not None:
+        return scheme.between(system, t0, start, t)
+    span = Span(t0, t, t - t0)
+    return advance(scheme, system, span, start)[0][0]
+
+
+def dense_info(
+    solver: AbstractPresymplecticSolver,
+    scheme: Scheme,
+    system: System,
+    span: Span,
+    start: Point,
+    end: Point,
+) -> dict[str, PyTree]:
+    """The data for the interpolation of a step, from its two ends."""
+    t0, t1, h = span
+    slope = lambda t, x: system.slope(t, x[0], scheme.end_force(x[1]))
+    y0, y1 = (system.values(x[0]) for x in (start, end))
+    k0, k1 = (tree_scale(h, slope(*x)) for x in ((t0, start), (t1, end)))
+    info = dict(y0=y0, y1=y1, k0=k0, k1=k1)
+    # The order of a scheme does not depend on the term.
+    number = _INNER_POINTS[bisect.bisect_left(_ORDERS, solver.order(None))]
+    if number == 0:
+        return info
+
+    def at(fraction):
+        t = t0 + fraction * h
+        y = between(scheme, system, t0, start, t)
+        return y, tree_scale(h, system.slope(t, y))
+
+    return info | dict(inner=lax.map(at, cast_to(inner_points(number), h)))
+
+
+def check_base(base) -> None:
+    if not isinstance(base, AbstractPresymplecticSolver):
+        raise ValueError(
+            "`base` must be a presymplectic solver, for example "
+            f"`PresymplecticLeapfrog()`, but got {base!r}."
+        )

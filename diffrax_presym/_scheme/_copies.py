@@ -1,0 +1,358 @@
+"""Schemes with two copies of the system, explicit for any energy.
+
+Each copy takes arguments from the other, and both share one moving frame. The state
+within a step is `y, (copy, field)`, with the velocity and force of the last exchange.
+"""
+
+import math
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Inexact, PyTree
+
+from .._compositions import stages
+from .._misc import (
+    as_parameter,
+    as_positive,
+    cast_to,
+    largest,
+    State,
+    tree_add,
+    tree_scale,
+)
+from .._system._bound import System
+from ._base import AbstractPresymplecticSolver, Scheme
+from ._engine import AbstractMove, inverse, Outcome, Span, Stage, Stages
+from ._tableaus import (
+    SOFRONIOU_SPALETTA_6,
+    SOFRONIOU_SPALETTA_8,
+    SOFRONIOU_SPALETTA_10,
+    SUZUKI_4,
+)
+
+
+def paired_field(system: System, t: Array, y: State, copy: State) -> State:
+    """Velocity and force at `q` of one copy and `p` of the other."""
+    at = (y[0], copy[1])
+    return system.velocity(t, at), system.force(t, at)
+
+
+class Exchange(AbstractMove):
+    """The flow of `H(t, q, p_copy)`, equation (tao_map1), or of `H(t, q_copy, p)`, for
+    the `second` copy. The field may be known, from the last exchange."""
+
+    second: bool = eqx.field(static=True, default=False)
+    known: bool = eqx.field(static=True, default=False)
+
+    def prepare(self, system: System, span: Span) -> None:
+        return None
+
+    def apply(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
+        if not self.known:
+            # The map does not change the arguments of its field: it is its own inverse.
+            return self.undo(system, span, data, stage)
+        return self._by(stage[1][1], system, span, stage), None
+
+    def undo(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
+        y, (copy, _) = stage
+        one, other = (copy, y) if self.second else (y, copy)
+        field = paired_field(system, span.t0, one, other)
+        return self._by(field, system, span, stage), None
+
+    def _by(self, field: State, system: System, span: Span, stage: Stage) -> Stage:
+        y, (copy, carried) = stage
+        velocity, force = tree_scale(span.h, field)
+        if self.second:
+            y, copy = system.add(y, (velocity, None)), system.add(copy, (None, force))
+            return y, (copy, carried)
+        y, copy = system.add(y, (None, force)), system.add(copy, (velocity, None))
+        return y, (copy, field)
+
+
+class MoveFrames(AbstractMove):
+    """Friction alone, of both copies."""
+
+    def prepare(self, system: System, span: Span) -> PyTree:
+        return system.prepare_decay(span.t0, span.h)
+
+    def apply(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+        y, (copy, field) = stage
+        return (system.decay(data, y), (system.decay(data, copy), field)), None
+
+    def undo(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+        return self.apply(system, span, data, stage)
+
+
+class Coupling(AbstractMove):
+    """The difference of the copies, rotated: equation (tao_flow)."""
+
+    strength: Inexact[Array, ""] | None
+
+    def prepare(self, system: System, span: Span) -> Array:
+        h = span.h
+        if self.strength is None:
+            return jnp.copysign(cast_to(3 * np.pi / 8, h), h)
+        return 2 * cast_to(self.strength, h) * h
+
+    def apply(self, system: System, span: Span, data: Array, stage: Stage) -> Outcome:
+        y, (copy, field) = stage
+        half = tree_scale(0.5, system.subtract(y, copy))
+        change = tree_add(rotate(data, half), -1, half)
+        copy = system.add(copy, tree_scale(-1, change))
+        return (system.add(y, change), (copy, field)), None
+
+    def undo(self, system: System, span: Span, data: Array, stage: Stage) -> Outcome:
+        return self.apply(system, span, data, stage)
+
+
+class Separate(AbstractMove):
+    """From the mean and half of the difference, rotated, to two copies; the inverse
+    joins them."""
+
+    angle: Inexact[Array, ""]
+    scale: Inexact[Array, ""]
+
+    def prepare(self, system: System, span: Span) -> None:
+        return None
+
+    def _rotated(self, h: Array, half: State) -> State:
+        # Half of the angle before and half after, with the sign of `h`, for symmetry.
+        angle = jnp.copysign(cast_to(self.angle, h) / 2, h)
+        return rotate(angle, half, cast_to(self.scale, h))
+
+    def apply(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
+        y, half = stage
+        half = self._rotated(span.h, half)
+        y, copy = system.add(y, half), system.add(y, tree_scale(-1, half))
+        return (y, (copy, paired_field(system, span.t0, y, copy))), None
+
+    def undo(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
+        y, (copy, field) = stage
+        half = tree_scale(0.5, system.subtract(y, copy))
+        y = system.add(y, tree_scale(-1, half))
+        result = _distance_check(system, span.h, y, half, field)
+        return (y, self._rotated(span.h, half)), result
+
+
+def _distance_check(system: System, h: Array, y: State, half: State, field: State):
+    """A failure once the copies have parted.
+
+    They are separate trajectories, and their mean is none, if they are further from
+    each other than they are large, or move in a step: what oscillates passes zero.
+    """
+    state, rates = system.values(y), system.values(field)
+    with jax.numpy_dtype_promotion("standard"):
+        sizes = [
+            jnp.maximum(largest(x), jnp.abs(h) * largest(rate))
+            for x, rate in zip(state, rates, strict=True)
+        ]
+        # Rounding may be larger than what is at rest.
+        eps = max(float(jnp.finfo(x.dtype).eps) for x in sizes)
+        rounding = eps ** (1 / 3) * jnp.maximum(*sizes)
+        pairs = zip(half, sizes, strict=True)
+        q, p = (2 * largest(x) > jnp.maximum(size, rounding) for x, size in pairs)
+    failure: Any = dfx.RESULTS.nonlinear_divergence
+    return dfx.RESULTS.where(q | p, failure, dfx.RESULTS.successful)
+
+
+def rotate(angle: Array, y: State, scale: ArrayLike = 1.0) -> State:
+    """`q` and `p` rotated into each other, with `q` in units of `scale`.
+
+    Both are updated at once. Sequential updates would not be symplectic, although the
+    energy would look right.
+    """
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    q, p = y
+    q1 = tree_add(tree_scale(cos, q), sin * scale, p)
+    return q1, tree_add(tree_scale(cos, p), -sin / scale, q)
+
+
+class PresymplecticTao(AbstractPresymplecticSolver):
+    r"""Tao's augmented integrator, explicit for every Hamiltonian.
+
+    2nd order, symmetric, and conformally symplectic in the doubled phase space. Three
+    evaluations of velocity and force per step. Uses 3rd order Hermite interpolation for
+    dense/ts output, at the cost of two more.
+
+    The phase space is doubled: the copy $(\bar q, \bar p)$ replaces the arguments that
+    would make the scheme implicit, and a harmonic coupling of strength $\xi$ keeps it
+    close. Both copies share one moving frame, in which the coupling acts unscaled, so
+    that it stays of the size of the dynamics under damping. The solution is the
+    original, and the `solver_state` holds the copy.
+
+    The scheme of the paper for nonseparable Hamiltonians.
+    [`diffrax_presym.PresymplecticCoupled`][] is much more accurate at equal cost,
+    especially at higher orders, and has no coupling to choose.
+
+    ??? cite "Reference"
+
+        Equations (tao_ham) to (tao_flow) of França, Jordan and Vidal (2021), after
+
+        ```bibtex
+        @article{tao2016explicit,
+            author={Tao, Molei},
+            title={Explicit symplectic approximation of nonseparable {H}amiltonians:
+                   Algorithm and long time performance},
+            journal={Physical Review E},
+            volume={94},
+            number={4},
+            pages={043303},
+            year={2016},
+        }
+        ```
+    """
+
+    coupling: Inexact[Array, ""] | None
+
+    def __init__(self, coupling=None):
+        r"""**Arguments:**
+
+        - `coupling`: the strength $\xi$ of the coupling, positive, in units of one over
+            time. A few times the highest frequency of the system is a good value.
+            Avoid $2 \xi h$ near a multiple of $\pi$, where the coupling resonates with
+            the step. Defaults to `None`, which is $\xi = 3\pi / 16h$, half-way between
+            resonance and copies that drift apart; not for use inside a
+            [`diffrax_presym.Composition`][].
+
+        **Raises:**
+
+        `ValueError` if `coupling` is known not to be positive, and when the solve is
+        traced if it is not a scalar.
+        """
+        if coupling is not None:
+            coupling = as_positive(coupling, "`PresymplecticTao(coupling)`")
+        self.coupling = coupling
+
+    @property
+    def is_symmetric(self) -> bool:
+        return True
+
+    def order(self, terms) -> int:
+        return 2
+
+    def scheme(self, system: System) -> Scheme:
+        if self.coupling is not None and jnp.shape(self.coupling) != ():
+            raise ValueError(
+                "`PresymplecticTao(coupling)` must be a scalar, but has shape "
+                f"{jnp.shape(self.coupling)}. To compare several, use `jax.vmap`."
+            )
+        frames = MoveFrames()
+        # The last map does not change its arguments: the next step reuses its field.
+        moves = (
+            *(Exchange(known=True), frames, Exchange(second=True)),
+            Coupling(self.coupling),
+            *(Exchange(second=True), frames, Exchange()),
+        )
+        table = [
+            *((0, 0, 0.5), (0, 0.5, 0.5), (0.5, 0.5, 0.5)),
+            (0.5, 0.5, 1),
+            *((0.5, 0.5, 0.5), (0.5, 1, 0.5), (1, 1, 0.5)),
+        ]
+        start = lambda system, t, y: (y, paired_field(system, t, y, y))
+        not_composable = None
+        if self.coupling is None:
+            not_composable = (
+                "Inside a composition `PresymplecticTao` needs a coupling that does "
+                "not change with the step size, or the order is lost. Write "
+                "`PresymplecticTao(coupling)` with a few times the highest frequency "
+                "of the system, or `PresymplecticCoupled(order)`, which needs none."
+            )
+        moves = Stages(moves, table)
+        return Scheme(moves, start=start, not_composable=not_composable)
+
+
+_WEIGHTS = {2: (1.0,)} | {
+    tableau.order: tableau.weights
+    for tableau in (
+        SUZUKI_4,
+        SOFRONIOU_SPALETTA_6,
+        SOFRONIOU_SPALETTA_8,
+        SOFRONIOU_SPALETTA_10,
+    )
+}
+
+
+def _check_order(order, name: str) -> int:
+    if order not in _WEIGHTS:
+        raise ValueError(
+            f"`{name}(order)` needs an order of 2, 4, 6, 8 or 10, but got {order!r}."
+        )
+    return order
+
+
+class PresymplecticCoupled(AbstractPresymplecticSolver):
+    r"""Two copies of the system, rotated about their mean once per composed step.
+
+    Order 2, 4, 6, 8 or 10 as given; 3, 11, 27, 43 or 71 evaluations of velocity and
+    force per step. Explicit for every energy, symmetric, and conformally
+    symplectic in the doubled phase space. Uses Hermite interpolation for dense/ts
+    output, at the cost of up to three more steps.
+
+    For energies that are neither separable nor split, explicitly.
+    [`diffrax_presym.PresymplecticTao`][] couples the copies within every stage, by a
+    strength that must suit both step and system. Here they are uncoupled for all stages
+    of a step. Then their difference, of the order of the local error, is rotated by a
+    fixed angle, so that it does not accumulate. The solution is their mean, which
+    depends on the difference only in second order. There is no strength to choose, and
+    no order is lost. The `solver_state` holds half of the difference. A solve fails,
+    with `RESULTS.nonlinear_divergence`, if the copies differ by more than their size,
+    or than they move in a step: the coupling is not stable with strong friction that is
+    part of the force. Then use shorter steps or
+    [`diffrax_presym.PresymplecticGauss`][].
+    """
+
+    composed_order: int = eqx.field(static=True)
+    angle: Inexact[Array, ""]
+    scale: Inexact[Array, ""]
+
+    def __init__(self, order: int = 2, angle=math.pi / 2, scale=1.0):
+        r"""**Arguments:**
+
+        - `order`: the order, 2, 4, 6, 8 or 10. Defaults to 2.
+        - `angle`: the angle by which the difference of the copies is rotated per step,
+            in radians. At multiples of $\pi$ it accumulates. Defaults to $\pi/2$.
+        - `scale`: the ratio of the sizes of `q` and `p`, which the rotation mixes. If
+            it is far off, only short steps are stable. Defaults to 1.
+
+        **Raises:**
+
+        `ValueError` if the order is not one of these, the angle is not a real number or
+        the scale is not positive.
+        """
+        self.composed_order = _check_order(order, "PresymplecticCoupled")
+        self.angle = as_parameter(angle, "`PresymplecticCoupled(angle=...)`")
+        self.scale = as_positive(scale, "`PresymplecticCoupled(scale=...)`")
+
+    @property
+    def is_symmetric(self) -> bool:
+        return True
+
+    def order(self, terms) -> int:
+        return self.composed_order
+
+    def scheme(self, system: System) -> Scheme:
+        frames = MoveFrames()
+        # The leapfrog of both copies, with arguments from each other. The next stage
+        # reuses the last field, since its arguments do not change.
+        moves = (
+            *(Exchange(known=True), frames, Exchange(second=True)),
+            *(frames, Exchange()),
+        )
+        table = [(0, 0, 0.5), (0, 0.5, 0.5), (0.5, 0.5, 1), (0.5, 1, 0.5), (1, 1, 0.5)]
+        weights = stages(_WEIGHTS[self.composed_order])
+        free = Stages([Stages(moves, table)], weights)
+        separate = Separate(self.angle, self.scale)
+        moves = separate, free, inverse(separate)
+        return Scheme(
+            Stages(moves, [(0, 0, 1), (0, 1, 1), (1, 1, 1)]),
+            start=lambda system, t, y: system.zeros(y),
+            not_composable=(
+                "`PresymplecticCoupled` composes its own stages, and rotates its "
+                "copies only at the ends of a step. Write "
+                "`PresymplecticCoupled(order)`."
+            ),
+        )

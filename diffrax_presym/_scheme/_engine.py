@@ -1,0 +1,324 @@
+"""One engine for all schemes that are lists of moves.
+
+A move maps the state within a step over a span of time, in two phases: what depends on
+time alone is prepared, for all stages at once, and what touches the state is applied.
+`Stages` are sequences of moves. A step, its inverse and its vector-Jacobian product all
+traverse the same list.
+"""
+
+import abc
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeAlias
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from .._friction._linear import Effects
+from .._misc import cast_to, tree_sum, tree_zeros
+from .._system._bound import System
+
+
+Result: TypeAlias = dfx.RESULTS | None  # `None`: no move could fail
+# The state within a step: positions and momenta, and the solver state.
+Stage: TypeAlias = PyTree
+Outcome: TypeAlias = tuple[Stage, Result]
+
+
+class Span(NamedTuple):
+    """An interval of time.
+
+    `h` is the difference of its ends, which may be more accurate than `t1 - t0`.
+    """
+
+    t0: Array
+    t1: Array
+    h: Array
+
+    def part(self, start, end, length) -> "Span":
+        """The part between two fractions of the span, `length` times as long."""
+        return Span(self._at(start), self._at(end), length * self.h)
+
+    def _at(self, fraction) -> Array:
+        if isinstance(fraction, float) and fraction in (0, 1):
+            return self.t1 if fraction else self.t0
+        # Rounding must not make the last stage miss the end of the step.
+        return jnp.where(fraction == 1, self.t1, self.t0 + fraction * self.h)
+
+    @property
+    def reversed(self) -> "Span":
+        return Span(self.t1, self.t0, -self.h)
+
+
+class AbstractMove(eqx.Module):
+    """A map over a span of time, and its inverse.
+
+    The inverse is called with the reversed span, and what was prepared for that.
+    """
+
+    @abc.abstractmethod
+    def prepare(self, system: System, span: Span) -> PyTree:
+        """What the move needs of time alone; called under `jax.vmap`."""
+
+    @abc.abstractmethod
+    def apply(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+        """The state at the end of the span, from that at its start."""
+
+    @abc.abstractmethod
+    def undo(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+        """The inverse: the state at the end of the reversed span."""
+
+
+class Inverse(AbstractMove):
+    """The inverse of a move, as a move."""
+
+    move: AbstractMove
+
+    def prepare(self, system: System, span: Span) -> PyTree:
+        return self.move.prepare(system, span)
+
+    def apply(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+        return self.move.undo(system, span, data, stage)
+
+    def undo(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+        return self.move.apply(system, span, data, stage)
+
+
+class Stages:
+    """A sequence of moves, repeated for each row of a table.
+
+    A row has three numbers for each move: its start, end and length, in units of the
+    whole.
+    """
+
+    moves: "tuple[Moves, ...]"
+    table: np.ndarray
+
+    def __init__(self, moves: "Sequence[Moves]", table):
+        self.moves = tuple(moves)
+        self.table = np.reshape(np.asarray(table, float), (-1, len(self.moves), 3))
+
+    @property
+    def inverse(self) -> "Stages":
+        """The adjoint sequence: the inverses in reverse order."""
+        moves = [inverse(move) for move in self.moves[::-1]]
+        start, end, length = np.moveaxis(self.table[::-1, ::-1], -1, 0)
+        return Stages(moves, np.stack([1 - end, 1 - start, length], axis=-1))
+
+    def distinct(self, move: int, once: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        """The distinct rows of a move to prepare, and which of them each row uses.
+
+        If that is done `once` for all steps, it depends on their lengths alone.
+        """
+        rows = self.table[:, move]
+        if not once:
+            return rows, None
+        lengths = np.round(rows[:, 2], 15)
+        _, first, which = np.unique(lengths, return_index=True, return_inverse=True)
+        return rows[first], which
+
+
+Moves: TypeAlias = AbstractMove | Stages
+
+
+def inverse(moves: Moves) -> Moves:
+    if isinstance(moves, Stages):
+        return moves.inverse
+    return moves.move if isinstance(moves, Inverse) else Inverse(moves)
+
+
+def prepare(moves: Moves, system: System, span: Span, backward: bool = False) -> PyTree:
+    """What all moves need of time alone, for a step: of the inverses if `backward`."""
+    return _expand(moves, system, _distinct(moves, system, span, backward))
+
+
+def prepare_once(
+    moves: Moves, system: System, span: Span, backward: bool = False
+) -> PyTree:
+    """The same for all steps of one length, in a form that is applied faster."""
+    data, friction = _distinct(moves, system, span, backward), system.friction
+    if friction is not None:
+        is_leaf = lambda x: isinstance(x, Effects)
+        fixed = lambda x: friction.fix(x) if is_leaf(x) else x
+        data = jtu.tree_map(fixed, data, is_leaf=is_leaf)
+    return _expand(moves, system, data)
+
+
+def _distinct(moves: Moves, system: System, span: Span, backward: bool) -> PyTree:
+    """What is prepared, once for all rows that need the same."""
+    if not isinstance(moves, Stages):
+        return moves.prepare(system, span.reversed if backward else span)
+
+    def column(i: int, move: Moves) -> PyTree:
+        rows, _ = moves.distinct(i, system.prepares_once)
+        one = lambda *row: _distinct(move, system, span.part(*row), backward)
+        if len(rows) == 1:
+            row = one(*rows[0].tolist())
+            return jtu.tree_map(lambda x: jnp.expand_dims(x, 0), row)
+        return jax.vmap(one)(*(cast_to(x, span.h) for x in rows.T))
+
+    return [column(i, move) for i, move in enumerate(moves.moves)]
+
+
+def _expand(moves: Moves, system: System, data: PyTree) -> PyTree:
+    """The same for all rows."""
+    if not isinstance(moves, Stages) or not system.prepares_once:
+        return data
+
+    def column(i: int, move: Moves) -> PyTree:
+        _, which = moves.distinct(i, True)
+        rows = (
+            jax.vmap(lambda x: _expand(move, system, x))(data[i])
+            if jtu.tree_leaves(data[i])
+            else data[i]
+        )
+        return jtu.tree_map(lambda x: x[which], rows)
+
+    return [column(i, move) for i, move in enumerate(moves.moves)]
+
+
+def forward(
+    moves: Moves, system: System, span: Span, data: PyTree, stage: Stage
+) -> Outcome:
+    """Apply all moves, in order, with what was prepared for them."""
+    act = lambda move, span, data, stage: move.apply(system, span, data, stage)
+    return _walk(act, moves, span, data, stage)[:2]
+
+
+def undo(moves: Moves, system: System, span: Span, back: PyTree, stage: Stage) -> Stage:
+    """The state at the start of the span, from that at its end."""
+    act = lambda move, span, back, stage: move.undo(system, span.reversed, back, stage)
+    return _walk(act, moves, span, back, stage, reverse=True)[0]
+
+
+def vjp(
+    moves: Moves,
+    system: System,
+    wanted: PyTree,
+    span: Span,
+    data: PyTree,
+    start: Stage,
+    bar: Stage,
+) -> tuple[PyTree, PyTree, Stage]:
+    """The vector-Jacobian product of moves, from the state at their start.
+
+    Returns the cotangents of the `wanted` leaves of the system, of what was prepared,
+    and of that state.
+    """
+    moved, fixed = eqx.partition(system, wanted)
+    redo = lambda moved, data, x: forward(
+        moves, eqx.combine(moved, fixed), span, data, x
+    )[0]
+    return jax.vjp(redo, moved, data, start)[1](bar)
+
+
+def vjp_step(
+    moves: Moves,
+    system: System,
+    wanted: PyTree,
+    span: Span,
+    both: tuple[PyTree, PyTree],
+    end: Stage,
+    bar: Stage,
+) -> tuple[Stage, PyTree, PyTree, Stage]:
+    """Invert all moves, and compute their vector-Jacobian product, move by move.
+
+    `both` is what was prepared for the moves, and for their inverses. Returns the state
+    at the start, and the cotangents of the `wanted` leaves of the system, of what was
+    prepared for the moves, and of that state.
+    """
+
+    def back(move: AbstractMove, span: Span, both: PyTree, x: PyTree):
+        end, gradient, bar = x
+        data, back = both
+        start, _ = move.undo(system, span.reversed, back, end)
+        more, prepared, bar = vjp(move, system, wanted, span, data, start, bar)
+        return (start, tree_sum(gradient, more), bar), None, prepared
+
+    state = end, tree_zeros(eqx.filter(system, wanted)), bar
+    (start, gradient, bar), _, prepared = _walk(
+        back, moves, span, both, state, reverse=True
+    )
+    return start, gradient, prepared, bar
+
+
+def _walk(
+    act: Callable,
+    moves: Moves,
+    span: Span,
+    data: PyTree,
+    state: PyTree,
+    reverse: bool = False,
+) -> tuple[PyTree, Result, PyTree]:
+    """Apply `act` to each move, its part of the span and its data, in order.
+
+    `act` returns the new state, a result or `None`, and something of the form of the
+    data or `None`, which is returned for all moves.
+    """
+    if not isinstance(moves, Stages):
+        return (*act(moves, span, data, state), None)[:3]
+    order = slice(None, None, -1 if reverse else 1)
+    number = len(moves.moves)
+    # `data` is a list with an entry for each move, or a pair of such lists.
+    paired = isinstance(data, tuple)
+    column = lambda i: tuple(x[i] for x in data) if paired else data[i]
+    columns = [column(i) for i in range(number)]
+
+    def row(state: PyTree, parts, data):
+        result, outputs = None, [None] * number
+        for i in range(number)[order]:
+            part = span.part(*parts[i])
+            state, more, outputs[i] = _walk(
+                act, moves.moves[i], part, data[i], state, reverse
+            )
+            result = first_failure(result, more)
+        return state, result, outputs
+
+    if len(moves.table) == 1:
+        first = jtu.tree_map(lambda x: x[0], columns)
+        state, result, outputs = row(state, moves.table[0].tolist(), first)
+        return state, result, jtu.tree_map(lambda x: jnp.expand_dims(x, 0), outputs)
+    # Moves, three numbers, rows. Each number once: a loop over few arrays is faster.
+    numbers = np.moveaxis(moves.table, 0, -1)
+    flat, which = np.unique(
+        numbers.reshape(-1, len(moves.table)), axis=0, return_inverse=True
+    )
+    which = which.reshape(numbers.shape[:2])
+
+    def body(state, x):
+        flat, data = x
+        parts = [[flat[i] for i in move] for move in which]
+        state, result, outputs = row(state, parts, data)
+        return state, (result, outputs)
+
+    rows = tuple(cast_to(x, span.h) for x in flat), columns
+    unroll = 1 if cheap_iterations() else True
+    state, (results, outputs) = lax.scan(
+        body, state, rows, reverse=reverse, unroll=unroll
+    )
+    if results is not None:
+        # The first stage that failed, or any if none did.
+        failed = jnp.argmax(results != dfx.RESULTS.successful)
+        results = jtu.tree_map(lambda x: x[failed], results)
+    return state, results, outputs
+
+
+def cheap_iterations() -> bool:
+    """Whether iterations of a loop are cheap, and code is not.
+
+    On a GPU an iteration takes ten microseconds or more, whatever is in it, so stages
+    are written out. On a CPU they were measured to take four to five times as long so.
+    """
+    return jax.default_backend() == "cpu"
+
+
+def first_failure(result: Result, other: Result) -> Result:
+    """The first of two results, or the second if the first is a success."""
+    if result is None or other is None:
+        return other if result is None else result
+    return dfx.RESULTS.where(result == dfx.RESULTS.successful, other, result)

@@ -1,0 +1,207 @@
+"""The solution of the equations of the stages of Gauss collocation."""
+
+from typing import Any, NamedTuple, Protocol
+
+import diffrax as dfx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import lineax as lx
+import numpy as np
+from jaxtyping import Array, Inexact, PyTree, Shaped
+
+from .._misc import largest, tree_scale, tree_sub, tree_sum, tree_zeros
+from ._moves import RootFind
+
+
+# Velocities and forces of all stages, times weight and length of the step, the forces
+# in the frame of its middle.
+Slopes = PyTree[Shaped[Array, "stages ..."]]
+# Positions and momenta of all stages, in that frame.
+Stages = PyTree[Shaped[Array, "stages ..."]]
+
+
+class Equations(Protocol):
+    """The equations of the stages of a step."""
+
+    h: Array
+
+    def stages(self, slopes: Slopes) -> Stages: ...
+
+    def slopes(self, stages: Stages) -> Slopes: ...
+
+    def residual(self, slopes: Slopes) -> Slopes: ...
+
+
+def implicit(step: Equations, find, guess: Slopes, tangent):
+    """The slopes that are found, with the derivatives of the implicit function.
+
+    `find` returns them and a result.
+    """
+
+    def as_float(residual, guess):
+        slopes, result = find(guess)
+        # `custom_root` gives integers a derivative of the wrong type.
+        code, kind = jtu.tree_flatten(result)
+        kinds.append(kind)
+        return slopes, [jnp.asarray(x, jnp.float32) for x in code]
+
+    kinds = []
+    slopes, code = lax.custom_root(
+        lambda x: step.residual(x), guess, as_float, tangent, has_aux=True
+    )
+    code = [lax.stop_gradient(x).astype(jnp.int32) for x in code]
+    return slopes, jtu.tree_unflatten(kinds[-1], code)
+
+
+class _Search(NamedTuple):
+    """The state of a fixed-point iteration."""
+
+    stages: Stages
+    slopes: Slopes
+    # One array, as XLA would make a kernel for each number. Changes are those of the
+    # stages, in units of their rounding.
+    record: Inexact[Array, "7"]
+
+
+# The entries of the record.
+_STATUS = 0  # of the search, one of the following
+_GOING, _CONVERGED, _FAILED = 0, 1, 2
+_COUNT = 1  # of iterations
+_LAST, _BEFORE = 2, 3  # change, and the one before
+_LEAST = 4  # change so far
+_STALLED = 5  # consecutive iterations without a smaller change
+_FRESH = 6  # whether it was restarted without a guess
+
+
+# Largest estimated change of another iteration, in units of rounding, to stop.
+_NEGLIGIBLE = 1e-3
+# Largest change at which stagnation is attributed to rounding.
+_ROUNDING = 16.0
+
+
+def fixed_point(step: Equations, guess: Slopes, max_iterations: int, tolerance: float):
+    """Fixed-point iteration, to rounding unless a tolerance is given.
+
+    It stops when its changes no longer decrease. The remaining error is rounding, of
+    either sign; that of a larger tolerance breaks the symmetry.
+    """
+    dtype = step.h.dtype
+    number = lambda x: jnp.asarray(x, dtype)
+    nothing = jtu.tree_map(jnp.zeros_like, guess)
+    eps = float(jnp.finfo(_lowest(guess)).eps)
+    loose, negligible = eps ** (-1 / 3), max(_NEGLIGIBLE, tolerance / eps)
+
+    def iterate(search: _Search) -> _Search:
+        _, count, last, before, least, stalled, fresh = search.record
+        slopes = step.slopes(search.stages)
+        stages = step.stages(slopes)
+        q, p = (_change(*x, dtype) for x in zip(stages, search.stages, strict=True))
+        change = jnp.maximum(q, p)
+        # Positions and momenta may each depend on the other alone, so that changes
+        # decrease over two iterations.
+        rate = jnp.maximum(change / last, last / before)
+        stalled = jnp.where(change < least, 0, stalled + 1)
+        # A component that is at rest changes by rounding alone.
+        converged = (
+            (change == 0)
+            | (rate * change <= negligible)
+            | ((stalled > 0) & (change <= _ROUNDING))
+            | ((stalled >= 3) & (jnp.minimum(q, p) <= loose))
+        )
+        # A guess may be outside of the domain although the state is inside.
+        finite = jnp.isfinite(change)
+        restart = ~finite & (fresh == 0)
+        failed = jnp.where(finite | restart, _GOING, _FAILED)
+        status = jnp.where(converged, _CONVERGED, failed)
+        least = jnp.minimum(change, least)
+        start = lambda x, y: jtu.tree_map(lambda x, y: jnp.where(restart, x, y), x, y)
+        record = start(
+            [_GOING, count + 1, 0, 0, jnp.inf, 0, 1],
+            [status, count + 1, change, last, least, stalled, fresh],
+        )
+        record = jnp.stack([number(x) for x in record])
+        return _Search(start(step.stages(nothing), stages), slopes, record)
+
+    def going(search: _Search):
+        record = search.record
+        return (record[_STATUS] == _GOING) & (record[_COUNT] < max_iterations)
+
+    record = np.zeros(7)
+    record[_LEAST] = np.inf
+    search = _Search(step.stages(guess), guess, number(record))
+    search = lax.while_loop(going, iterate, search)
+    status = search.record[_STATUS]
+    results: Any = dfx.RESULTS
+    failure = results.where(
+        status == _FAILED,
+        results.nonlinear_divergence,
+        results.nonlinear_max_steps_reached,
+    )
+    converged = status == _CONVERGED
+    return search.slopes, results.where(converged, results.successful, failure)
+
+
+def by_root_finder(step: Equations, guess: Slopes, find: RootFind):
+    # Extrapolation of stiff components may be inaccurate.
+    sizes = (largest(step.residual(x)) for x in (guess, tree_zeros(guess)))
+    better = jnp.less(*sizes)
+    guess = jtu.tree_map(lambda x: jnp.where(better, x, 0), guess)
+    return find(lambda slopes: step.slopes(step.stages(slopes)), guess)
+
+
+def _lowest(x: PyTree):
+    """The lowest precision of the leaves."""
+    dtypes = [leaf.dtype for leaf in jtu.tree_leaves(x)]
+    return max(dtypes, key=lambda dtype: float(jnp.finfo(dtype).eps))
+
+
+def _change(x: PyTree, y: PyTree, dtype) -> Inexact[Array, ""]:
+    """The largest difference, in units of the rounding of the largest entry."""
+
+    def leaf(x, y):
+        info = jnp.finfo(x.dtype)
+        size = float(info.eps) * jnp.max(jnp.abs(x), initial=0)
+        change = jnp.max(jnp.abs(x - y), initial=0)
+        return (change / jnp.maximum(size, float(info.tiny))).astype(dtype)
+
+    return jtu.tree_reduce(jnp.maximum, jtu.tree_map(leaf, x, y), jnp.zeros((), dtype))
+
+
+def contract(g, y: Slopes) -> Slopes:
+    """Solve a linear system of a residual by the same iteration."""
+
+    def solve(g, b):
+        # x = x + g(x) - b
+        def iterate(state):
+            x, _, least, stalled, count = state
+            new = tree_sub(tree_sum(x, g(x)), b)
+            change, size = largest(tree_sub(new, x)), largest(new)
+            stalled = jnp.where(change < least, 0, stalled + 1)
+            going = (change > eps / 8 * size) & (stalled < 3)
+            return new, going, jnp.minimum(change, least), stalled, count + 1
+
+        start = tree_scale(-1, b)
+        eps = float(jnp.finfo(_lowest(b)).eps)
+        state = (
+            start,
+            jnp.array(True),
+            jnp.asarray(jnp.inf, largest(b).dtype),
+            jnp.asarray(0),
+            jnp.asarray(0),
+        )
+        x, going, least, *_ = lax.while_loop(
+            lambda state: state[1] & (state[-1] < 200), iterate, state
+        )
+        # Never numbers as if nothing had happened.
+        solved = ~going & (least <= eps ** (1 / 2) * largest(x))
+        return jtu.tree_map(lambda x: jnp.where(solved, x, jnp.nan), x)
+
+    return lax.custom_linear_solve(g, y, solve, transpose_solve=solve)
+
+
+def factorise(g, y: Slopes) -> Slopes:
+    """The same by a factorisation of the matrix."""
+    operator = lx.FunctionLinearOperator(g, jax.eval_shape(lambda: y))
+    return lx.linear_solve(operator, y, lx.AutoLinearSolver(well_posed=True)).value

@@ -1,0 +1,330 @@
+import math
+from typing import ClassVar, TYPE_CHECKING
+
+import equinox as eqx
+import numpy as np
+
+from .._compositions import stages
+from .._system._bound import System
+from .._system._split import AbstractSplit
+from ._base import AbstractPresymplecticSolver, Scheme
+from ._engine import inverse, Stages
+from ._moves import Drift, Enter, Kick
+from ._tableaus import (
+    BLANES_CASAS_RKN_8,
+    BLANES_MOAN_4,
+    BLANES_MOAN_6,
+    BLANES_MOAN_RKN_4,
+    BLANES_MOAN_RKN_6,
+    SplittingTableau,
+    STRANG,
+    TUNED_LINEAR_8,
+    TUNED_RKN_6,
+)
+
+
+if TYPE_CHECKING:
+    # To a type checker an abstract field is any kind of field.
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
+
+
+class AbstractSplitting(AbstractPresymplecticSolver):
+    """Exact drifts and kicks alternately, each over a fraction of the step."""
+
+    tableau: AbstractVar[SplittingTableau]
+
+    @property
+    def is_symmetric(self) -> bool:
+        return self.tableau.fractions == self.tableau.fractions[::-1]
+
+    def order(self, terms) -> int:
+        return self.tableau.order
+
+    def scheme(self, system: System) -> Scheme:
+        split, tableau = find_split(self, self.tableau.kind, system), self.tableau
+        kind, order, first = tableau.kind, tableau.order, tableau.kick_first
+        drift, kick = Drift(kind, order), Kick(kind, order)
+        drifts = stages(tableau.fractions[first::2])
+        kicks = tableau.fractions[not first :: 2]
+        pairs = kicks[first:]
+        ends = drifts[: len(pairs), 1]
+        table = np.stack([ends, ends, pairs], axis=-1)
+        pair = Stages([drift, kick], np.stack([drifts[: len(pairs)], table], axis=1))
+        if first:
+            moves, spans = [Kick(kind, order, known=True), pair], [(0, 0, kicks[0])]
+            spans.append((0, 1, 1))
+        else:
+            moves, spans = [pair, drift], [(0, 1, 1), tuple(drifts[-1])]
+        if kind == "shared":
+            enter = Enter()
+            moves = [enter, *moves, inverse(enter)]
+            spans = [(0, 0, 0), *spans, (1, 1, 0)]
+        if not first:
+            return Scheme(Stages(moves, spans))
+        return Scheme(
+            Stages(moves, spans),
+            # The force of the last kick is that of the first kick of the next step.
+            start=lambda system, t, y: _first_force(system, kind, t, y),
+            # Otherwise a kick is by a part of the force only.
+            end_force=lambda carry: carry if "separable" in split.kinds else None,
+        )
+
+
+def _first_force(system: System, kind: str, t, y):
+    split = system.split(kind)
+    return split.force(system, t, split.enter(system, t, y) if kind == "shared" else y)
+
+
+def find_split(
+    solver: AbstractPresymplecticSolver, kind: str, system: System
+) -> AbstractSplit:
+    """The split that a scheme uses; an error if the system has none of this kind."""
+    split, name = system.split(kind), type(solver).__name__
+    if split is not None:
+        return split
+    if kind == "shared":
+        raise ValueError(
+            f"`{name}` needs a known mass that does not depend on time, and one rate "
+            "of friction for all momenta, with a derivative: that of a function eta(t) "
+            "may jump. Write `MechanicalSystem(QuadraticKinetic(mass), potential, "
+            "friction)` with such friction, or none. Otherwise use `TunedRKN6()`, "
+            "`BlanesMoan6()` or `PresymplecticGauss()`."
+        )
+    if system.split("any") is None:
+        raise ValueError(
+            f"`{name}` needs a system split into a kinetic part and a potential, but "
+            f"this `{system.name}` is not. If its energy is a sum of the two, give its "
+            "parts: `MechanicalSystem(kinetic, potential)`. With a `force=f`, and for "
+            "any other energy, there are no such parts: use `PresymplecticGauss()`."
+        )
+    raise ValueError(
+        f"`{name}` keeps its order only for a quadratic kinetic energy, written as "
+        "`QuadraticKinetic(mass)`, or a quadratic potential, written as "
+        "`QuadraticPotential(stiffness)`; and for friction that depends neither on "
+        "positions nor on the speed. Otherwise use `BlanesMoan4()` or `BlanesMoan6()`."
+    )
+
+
+class Splitting(AbstractSplitting):
+    """A splitting into exact drifts and kicks, given by a tableau.
+
+    Order as stated by the tableau; one force evaluation per kick, and one less if the
+    step starts with a kick. Uses Hermite interpolation for dense/ts output, at the
+    cost of up to three more steps.
+
+    For systems whose kinetic part has a known flow, where it is far more accurate
+    than a composition at equal cost.
+    """
+
+    tableau: SplittingTableau = eqx.field(static=True)
+
+    def __init__(self, tableau: SplittingTableau):
+        """**Arguments:**
+
+        - `tableau`: a [`diffrax_presym.SplittingTableau`][].
+
+        **Raises:**
+
+        `ValueError` if the drifts or the kicks do not sum to one, if the first and the
+        last move are of different kinds, or if the order is not a positive integer.
+        """
+        if not isinstance(tableau, SplittingTableau):
+            raise ValueError(
+                "`Splitting` needs a tableau, `Splitting(SplittingTableau(order, "
+                f"kick_first, kind, fractions))`, but got {tableau!r}."
+            )
+        if not isinstance(tableau.order, int) or tableau.order < 1:
+            raise ValueError(
+                "`SplittingTableau(order=...)` must be a positive integer, but got "
+                f"{tableau.order!r}."
+            )
+        fractions = tuple(float(x) for x in tableau.fractions)
+        first, second = fractions[0::2], fractions[1::2]
+        sums = math.fsum(first), math.fsum(second)
+        if len(first) != len(second) + 1 or any(not abs(x - 1) < 1e-12 for x in sums):
+            names = ("kicks", "drifts")[:: 1 if tableau.kick_first else -1]
+            raise ValueError(
+                "`SplittingTableau(fractions=...)` needs an odd number of moves, "
+                "alternately drifts that sum to one and kicks that sum to one, but got "
+                f"{len(first)} {names[0]} that sum to {sums[0]} and {len(second)} "
+                f"{names[1]} that sum to {sums[1]}. To scale them, divide each kind by "
+                "its sum."
+            )
+        self.tableau = tableau._replace(fractions=fractions)
+
+
+class Strang(AbstractSplitting):
+    """Strang's splitting: kick, drift, kick; the leapfrog with an exact drift.
+
+    2nd order and symmetric. One force evaluation per step. Uses 3rd order Hermite
+    interpolation for dense/ts output, at the cost of two more unless the system is
+    separable.
+
+    For any system with a kinetic part of known flow, especially
+    [`diffrax_presym.BregmanHamiltonian`][], for which it is explicit and
+    [`diffrax_presym.PresymplecticLeapfrog`][] is not.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{strang1968construction,
+            author={Strang, Gilbert},
+            title={On the construction and comparison of difference schemes},
+            journal={SIAM Journal on Numerical Analysis},
+            volume={5},
+            number={3},
+            pages={506--517},
+            year={1968},
+        }
+        ```
+    """
+
+    tableau: ClassVar[SplittingTableau] = STRANG
+
+
+class BlanesMoan4(AbstractSplitting):
+    """Blanes and Moan's fourth-order splitting S6, for any kinetic energy.
+
+    4th order and symmetric. Six force evaluations per step. Uses Hermite
+    interpolation for dense/ts output, at the cost of another step.
+
+    For any system with a kinetic part of known flow, such as a relativistic one.
+    If the kinetic energy or the potential is quadratic,
+    [`diffrax_presym.BlanesMoanRKN4`][] is more efficient.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{blanes2002practical,
+            author={Blanes, Sergio and Moan, Per Christian},
+            title={Practical symplectic partitioned {R}unge--{K}utta and
+                   {R}unge--{K}utta--{N}ystr{\\"o}m methods},
+            journal={Journal of Computational and Applied Mathematics},
+            volume={142},
+            number={2},
+            pages={313--330},
+            year={2002},
+        }
+        ```
+    """
+
+    tableau: ClassVar[SplittingTableau] = BLANES_MOAN_4
+
+
+class BlanesMoan6(AbstractSplitting):
+    """Blanes and Moan's sixth-order splitting S10, for any kinetic energy.
+
+    6th order and symmetric. Ten force evaluations per step. Uses Hermite
+    interpolation for dense/ts output, at the cost of three more steps.
+
+    For any system with a kinetic part of known flow. If the kinetic energy or the
+    potential is quadratic, [`diffrax_presym.TunedRKN6`][] is more efficient.
+
+    Source: Blanes and Moan (2002), see [`diffrax_presym.BlanesMoan4`][].
+    """
+
+    tableau: ClassVar[SplittingTableau] = BLANES_MOAN_6
+
+
+class BlanesMoanRKN4(AbstractSplitting):
+    """Blanes and Moan's fourth-order Runge--Kutta--Nyström splitting SRKN 6b.
+
+    4th order and symmetric. Six force evaluations per step. Uses Hermite
+    interpolation for dense/ts output, at the cost of another step.
+
+    For quadratic kinetic energies or quadratic potentials: the first choice at moderate
+    accuracy.
+
+    Source: Blanes and Moan (2002), see [`diffrax_presym.BlanesMoan4`][].
+    """
+
+    tableau: ClassVar[SplittingTableau] = BLANES_MOAN_RKN_4
+
+
+class BlanesMoanRKN6(AbstractSplitting):
+    """Blanes and Moan's sixth-order Runge--Kutta--Nyström splitting SRKN 14a.
+
+    6th order and symmetric. Fourteen force evaluations per step. Uses Hermite
+    interpolation for dense/ts output, at the cost of three more steps.
+
+    For quadratic kinetic energies or quadratic potentials. For oscillations
+    [`diffrax_presym.TunedRKN6`][] is more accurate.
+
+    Source: Blanes and Moan (2002), see [`diffrax_presym.BlanesMoan4`][].
+    """
+
+    tableau: ClassVar[SplittingTableau] = BLANES_MOAN_RKN_6
+
+
+class BlanesCasasRKN8(AbstractSplitting):
+    """The eighth-order Runge--Kutta--Nyström splitting of Blanes, Casas et al.
+
+    8th order and symmetric. Nineteen force evaluations per step. Uses Hermite
+    interpolation for dense/ts output, at the cost of three more steps.
+
+    For quadratic kinetic energies or quadratic potentials: the first choice for errors
+    close to rounding in `float64`.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @misc{blanes2022symmetric,
+            author={Blanes, Sergio and Casas, Fernando and
+                    Escorihuela-Tom{\\`a}s, Alejandro},
+            title={{R}unge--{K}utta--{N}ystr{\\"o}m symplectic splitting methods of
+                   order 8},
+            year={2022},
+            eprint={2202.01541},
+            archivePrefix={arXiv},
+            primaryClass={math.NA},
+        }
+        ```
+    """
+
+    tableau: ClassVar[SplittingTableau] = BLANES_CASAS_RKN_8
+
+
+class TunedRKN6(AbstractSplitting):
+    """A sixth-order Runge--Kutta--Nyström splitting, tuned for oscillations.
+
+    6th order and symmetric. Fourteen force evaluations per step. Uses Hermite
+    interpolation for dense/ts output, at the cost of three more steps.
+
+    For quadratic kinetic energies or quadratic potentials: the first choice from six
+    digits on. For oscillations about equilibria its error is much smaller than that of
+    [`diffrax_presym.BlanesMoanRKN6`][] at equal cost.
+
+    Source: this package, `benchmarks/tuning.py`. The coefficients satisfy the
+    conditions of order 6, and reduce the remaining error for oscillators over a range
+    of frequencies and, at the next order, for any force.
+    """
+
+    tableau: ClassVar[SplittingTableau] = TUNED_RKN_6
+
+
+class TunedLinear8(AbstractSplitting):
+    r"""A splitting for linear forces, with steps of half a period or more.
+
+    8th order and symmetric for linear forces and constant friction. Fourteen force
+    evaluations per step. Uses Hermite interpolation for dense/ts output, at the cost of
+    three more steps.
+
+    For forces linear in the positions, by a matrix or a stencil: damped waves, networks
+    of springs, quadratic objectives. It allows the longest steps per force evaluation:
+    the error of a step is 1e-9 if the step times the highest frequency is 3.6, or 0.26
+    per evaluation. Its coefficients are tuned for a range of frequencies rather than
+    for short steps. With friction split between positions and momenta, $q = e^{-\eta /
+    2} x$, the motion of $x$ is again an oscillation, so that constant friction costs no
+    accuracy up to rates of twice the highest frequency.
+
+    Only of 4th order, and less accurate than [`diffrax_presym.TunedRKN6`][], if the
+    force is nonlinear, or if force or friction depends on time. Not for friction
+    $\gamma / t$ from $t = 0$. Interpolation over such long steps is inaccurate: to save
+    at many times, let steps end there, with `diffrax.StepTo`.
+
+    Source: this package, `benchmarks/tuning.py`.
+    """
+
+    tableau: ClassVar[SplittingTableau] = TUNED_LINEAR_8

@@ -1,0 +1,251 @@
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import diffrax as dfx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import optimistix as optx
+from jaxtyping import Array, Bool, Inexact, PyTree
+
+from .._friction._base import AbstractFriction, Mechanics, Parts
+from .._friction._damping import AbstractDamping
+from .._friction._linear import fit_friction, LinearFriction, one_rate
+from .._misc import (
+    as_time,
+    describe,
+    match,
+    Scalar,
+    State,
+    Time,
+    tree_scale,
+    tree_sub,
+    tree_sum,
+    tree_zeros,
+)
+from ._split import AbstractSplit
+
+
+Q = PyTree[Inexact[Array, "..."]]
+P = PyTree[Inexact[Array, "..."]]
+
+
+class AbstractSystem(dfx.AbstractTerm):
+    r"""A mechanical system: the equations of motion, as a Diffrax term.
+
+    The state is a pair `(q, p)` of pytrees of one structure, the positions and the
+    *mechanical* momenta. With an energy $E$ and a log scale $\eta$ of the friction, the
+    Hamiltonian is $H(t, q, P) = e^{\eta(t)} E(t, q, e^{-\eta(t)} P)$, and
+    $p = e^{-\eta(t)} P$: it stays of the size of the velocity under damping, where the
+    canonical momentum $P$ overflows in `float32` once $\eta(t)$ exceeds 88.
+
+    Pass it to `diffrax.diffeqsolve`, with a solver of this package or any other of
+    Diffrax for ordinary differential equations, which uses the full vector field
+    $(\partial E/\partial p, -\partial E/\partial q - \eta'(t) \, p)$.
+
+    To write a system of your own, subclass it with `energy`, `velocity`, `force` and
+    `splits`.
+    """
+
+    @property
+    @abc.abstractmethod
+    def splits(self) -> tuple[AbstractSplit, ...]:
+        """The pairs of exact flows into which the motion splits, the best first; `()`
+        if no exact flow is known."""
+
+    @abc.abstractmethod
+    def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
+        """The mechanical energy $E(t, q, p)$."""
+
+    @abc.abstractmethod
+    def velocity(self, t: Time, q: Q, p: P, args: PyTree = None) -> Q:
+        r"""The velocity $\partial E / \partial p$."""
+
+    @abc.abstractmethod
+    def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
+        r"""The force $-\partial E / \partial q$, and all other forces but linear
+        friction that depends on time alone."""
+
+    # What is different for some systems.
+
+    def velocity_and_force(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> tuple[Q, P]:
+        """Both at once, where they share computations."""
+        return self.velocity(t, q, p, args), self.force(t, q, p, args)
+
+    def add(self, y: State, dy: tuple[Q | None, P | None]) -> State:
+        """The state `y` displaced by `dy`, of which either part may be `None`: a sum,
+        or a step on a manifold. Solvers update states by it alone."""
+        return tuple(  # pyright: ignore[reportReturnType]
+            x if dx is None else tree_sum(x, dx) for x, dx in zip(y, dy, strict=True)
+        )
+
+    def is_valid(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> Bool[Array, ""] | None:
+        """Whether the energy is defined at this state; if not, a solve fails. `None`,
+        the default, means that it is not checked."""
+        return None
+
+    @property
+    def parts(self) -> Parts:
+        """The friction, by where it acts. None by default."""
+        return Parts()
+
+    @property
+    def mechanics(self) -> Mechanics:
+        """What friction needs to know of the system; by default nothing is known."""
+        return Mechanics(None, None, has_mass=False)
+
+    @property
+    def drift_is_autonomous(self) -> bool:
+        """Whether a drift depends on time by the length of its span alone, so that it
+        is prepared once for steps of one length."""
+        return False
+
+    # The full vector field, for Diffrax.
+
+    def vf(self, t, y: State, args: PyTree) -> State:
+        check_state(y)
+        t = as_time(t)
+        velocity, force = self.velocity_and_force(t, *y, args)
+        friction = self.fit_friction(y[1])
+        return velocity, force if friction is None else friction.net_force(
+            t, force, y[1]
+        )
+
+    def contr(self, t0, t1, **kwargs):
+        return t1 - t0
+
+    def prod(self, vf: State, control) -> State:
+        return tree_scale(control, vf)
+
+    # Friction.
+
+    def fit_friction(self, p: P) -> LinearFriction | None:
+        """The linear friction that depends on time alone, for momenta like `p`."""
+        return fit_friction(self.parts.linear, self.mechanics, p)
+
+    def friction_force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
+        """The force of all friction."""
+        friction, zero = self.fit_friction(p), tree_zeros(p)
+        return zero if friction is None else friction.net_force(t, zero, p)
+
+    @property
+    def damping(self) -> AbstractDamping | None:
+        """The law of friction, if that is one rate for all momenta; `ValueError` if
+        there is other friction."""
+        return one_rate(self.parts)
+
+    # Canonical momenta, and velocities.
+
+    def log_scale(self, t: Time) -> Scalar:
+        r"""The log scale $\eta(t)$; 0 for a system without damping."""
+        t = as_time(t)
+        return jnp.zeros_like(t) if self.damping is None else self.damping(t)
+
+    def canonical(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
+        r"""The value of the Hamiltonian, $e^{\eta(t)} E(t, q, p)$.
+
+        `p` is the mechanical momentum, as in a solution.
+        """
+        energy = self.energy(t, q, p, args)
+        return tree_scale(jnp.exp(self.log_scale(t)), energy)
+
+    def to_canonical(self, t: Time, p: P) -> P:
+        r"""From the mechanical momentum to the canonical, $P = e^{\eta(t)} p$."""
+        return tree_scale(jnp.exp(self.log_scale(t)), p)
+
+    def from_canonical(self, t: Time, P: P) -> P:
+        r"""From the canonical momentum to the mechanical, $p = e^{-\eta(t)} P$."""
+        return tree_scale(jnp.exp(-self.log_scale(t)), P)
+
+    def from_velocity(self, t: Time, y: tuple[Q, Q], args: PyTree = None) -> State:
+        """The state `(q, p)` of positions and velocities `(q, v)`."""
+        return momentum_of(self, t, *y, args)
+
+    def to_velocity(self, t: Time, y: State, args: PyTree = None) -> tuple[Q, Q]:
+        """Positions and velocities `(q, v)` of a state `(q, p)`: save them by
+        `SaveAt(..., fn=system.to_velocity)`."""
+        q, p = y
+        return q, self.velocity(t, q, p, args)
+
+
+class AbstractKineticSystem(AbstractSystem):
+    """A system with a kinetic part of known flow, the drift of a
+    [`diffrax_presym.extend.KineticSplit`][]."""
+
+    @abc.abstractmethod
+    def prepare_drift(
+        self, friction: LinearFriction | None, t: Time, h: Time, order: int
+    ) -> PyTree:
+        """What the flow of the kinetic part from `t` to `t + h`, friction included,
+        needs of time alone."""
+
+    @abc.abstractmethod
+    def drift(
+        self,
+        friction: LinearFriction | None,
+        t: Time,
+        h: Time,
+        data: Any,
+        q: Q,
+        p: P,
+        args: PyTree,
+    ) -> tuple[Q, P | None]:
+        """The changes of `q` and `p` over the flow of the kinetic part."""
+
+    @abc.abstractmethod
+    def potential_force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
+        r"""The force $-\partial V / \partial q$ of the potential part."""
+
+
+def check_state(y: PyTree) -> None:
+    wanted = "The state must be a pair `(q, p)` of positions and momenta"
+    if type(y) is not tuple or len(y) != 2:
+        raise ValueError(f"{wanted}, but got {describe(y)}. Write `y0=(q0, p0)`.")
+    q, p = y
+    if describe(q) != describe(p):
+        raise ValueError(
+            f"{wanted} of one structure, shape and precision, but got q of "
+            f"{describe(q)} and p of {describe(p)}."
+        )
+    for leaf in jtu.tree_leaves(y):
+        if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+            raise ValueError(
+                f"{wanted} in real floating point, but got {describe(q)}. Convert "
+                "them with `jnp.asarray(x, float)`, a complex number to its real and "
+                "imaginary parts."
+            )
+
+
+def momentum_of(system: AbstractSystem, t: Time, q: Q, v: Q, args: PyTree) -> State:
+    """The state of positions and velocities, by Newton's method from the momentum that
+    is equal to the velocity."""
+    residual = lambda p, _: tree_sub(system.velocity(t, q, p, args), v)
+    eps = max(float(jnp.finfo(x.dtype).eps) for x in jtu.tree_leaves(v))
+    finder = optx.Newton(rtol=10 * eps, atol=10 * eps)
+    return q, optx.root_find(residual, finder, v).value
+
+
+def add_forces(
+    force: P,
+    laws: tuple[AbstractFriction, ...],
+    mechanics: Mechanics,
+    external: Callable | None,
+    t: Time,
+    q: Q,
+    p: P,
+    v: Q,
+    args: PyTree,
+) -> P:
+    """A force, and what else acts on a state of velocity `v`: the friction that is not
+    part of drifts, and a user's force `external(t, q, v, args)`."""
+    for law in laws:
+        if not law.parts(mechanics).linear:
+            force = tree_sum(force, law.force(t, q, p, v, args))
+    if external is None:
+        return force
+    value = external(t, q, v, args)
+    return tree_sum(force, match(value, q, "`force`", "`q`"))

@@ -1,0 +1,173 @@
+"""The interface between solvers and systems."""
+
+from typing import Any, TypeVar
+
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, ArrayLike, PyTree
+
+from .._friction._damping import AbstractDamping
+from .._friction._linear import LinearFriction
+from .._misc import cast_to, State, Time, tree_sub, tree_zeros, values
+from ._base import AbstractSystem
+
+
+_T = TypeVar("_T")
+NONFINITE: Any = dfx.RESULTS.nonfinite  # pyright: ignore[reportAttributeAccessIssue]
+
+
+class System(eqx.Module):
+    """A system as solvers use it: bound to its arguments and to a direction of time,
+    with the friction of momenta of one shape.
+
+    The leaves of a state `(q, p)` are arrays or, with compensated summation, `Sum`s. So
+    states are updated with `add` and read with `values`; the other methods take states
+    of either kind.
+    """
+
+    term: Any  # an `AbstractSystem`
+    args: PyTree
+    direction: int | Array
+    friction: LinearFriction | None
+
+    def __init__(self, term: AbstractSystem, args: PyTree, direction, y: State):
+        self.term, self.args, self.direction = term, args, direction
+        self.friction = term.fit_friction(values(y)[1])
+
+    def time(self, t: ArrayLike) -> Array:
+        """The physical time, which runs backwards where `direction` is -1."""
+        return jnp.asarray(t) * cast_to(self.direction, t)
+
+    # States.
+
+    def add(self, y: State, dy: tuple[PyTree, PyTree]) -> State:
+        """The state displaced by `dy`, of which either part may be `None`."""
+        return self.term.add(y, dy)
+
+    def subtract(self, x: PyTree, y: PyTree) -> PyTree:
+        """The difference of two states, or parts of these, as arrays."""
+        return tree_sub(x, y)
+
+    def values(self, x: _T) -> _T:
+        """The arrays of a state, or part of one."""
+        return values(x)
+
+    def zeros(self, x: PyTree) -> PyTree:
+        """Arrays of zeros like a state, or part of one."""
+        return tree_zeros(values(x))
+
+    # The vector field.
+
+    @property
+    def name(self) -> str:
+        """The class of the system, for errors."""
+        return type(self.term).__name__
+
+    def velocity(self, t: Time, y: State) -> PyTree:
+        """The velocity, which is the derivative of `q`."""
+        return self.term.velocity(t, *values(y), self.args)
+
+    def force(self, t: Time, y: State) -> PyTree:
+        """The force on `p`, without linear friction."""
+        return _stored(self.term.force(t, *values(y), self.args), t)
+
+    def velocity_and_force(self, t: Time, y: State) -> State:
+        """The vector field without linear friction."""
+        velocity, force = self.term.velocity_and_force(t, *values(y), self.args)
+        return velocity, _stored(force, t)
+
+    def potential_force(self, t: Time, y: State) -> PyTree:
+        """The force of a kick, without that of the kinetic part."""
+        return _stored(self.term.potential_force(t, *values(y), self.args), t)
+
+    def slope(self, t: Time, y: State, force: PyTree | None = None) -> State:
+        """The full vector field, with friction. Reuses a given force."""
+        y = values(y)
+        if force is None:
+            velocity, force = self.velocity_and_force(t, y)
+        else:
+            velocity = self.velocity(t, y)
+        if self.friction is not None:
+            force = self.friction.net_force(t, force, y[1])
+        return velocity, force
+
+    def check(self, t: Time, y: State) -> dfx.RESULTS | None:
+        """A failure where the energy is not defined; `None` if that is not checked."""
+        valid = self.term.is_valid(t, *values(y), self.args)
+        if valid is None:
+            return None
+        return dfx.RESULTS.where(valid, dfx.RESULTS.successful, NONFINITE)
+
+    # Friction.
+
+    def prepare_decay(self, t: Time, h: Time) -> PyTree:
+        """What the decay of a momentum from `t` to `t + h` needs of time alone."""
+        return None if self.friction is None else self.friction.prepare(t, h, 1)
+
+    def decay(self, data: PyTree, y: State) -> State:
+        """The momentum in the frame of the end of a span: friction alone."""
+        if self.friction is None:
+            return y
+        return self.add(y, (None, self.friction.decay(data, values(y[1]))))
+
+    def move_frame(self, data: PyTree, p: PyTree) -> PyTree:
+        """The same for momenta alone, or forces, as arrays."""
+        if self.friction is None:
+            return p
+        return jtu.tree_map(jnp.add, p, self.friction.decay(data, p))
+
+    @property
+    def one_rate(self) -> AbstractDamping | None:
+        """The law of friction, where it is known to be one rate for all momenta."""
+        return self.term.damping
+
+    # Splits.
+
+    def split(self, kind: str) -> Any:
+        """The first split of a kind, see `_split.py`; `None` if there is none."""
+        splits = (split for split in self.term.splits if kind in split.kinds)
+        return next(splits, None)
+
+    @property
+    def is_separable(self) -> bool:
+        """Whether the velocity depends on `p` alone, and the force on `q`."""
+        return self.split("separable") is not None
+
+    @property
+    def prepares_once(self) -> bool:
+        """Whether what is prepared for a drift depends on its length alone."""
+        return self.term.drift_is_autonomous and (
+            self.friction is None or self.friction.is_autonomous
+        )
+
+
+def _stored(force: PyTree, t: Time) -> PyTree:
+    # A selection, which always gives the force, makes XLA store it. Otherwise XLA
+    # recomputes an elementwise force wherever it is used. At a time that is not a
+    # number neither is the force.
+    return jtu.tree_map(lambda f: jnp.where(t == t, f, jnp.nan), force)
+
+
+def bind(terms: PyTree, args: PyTree, y: State) -> System:
+    """The system of the term that `diffeqsolve` passes to a solver."""
+    term, direction = terms, 1
+    # Diffrax wraps a term to solve backwards in time. The wrapper is private, so it is
+    # recognised by its two attributes.
+    if hasattr(term, "term") and hasattr(term, "direction"):
+        term, direction = term.term, term.direction
+    if isinstance(term, AbstractSystem):
+        return System(term, args, direction, y)
+    if type(term).__name__ == "AdjointTerm":
+        raise ValueError(
+            "`BacksolveAdjoint()` solves the adjoint equations, which are not "
+            "Hamiltonian, with the same solver. Write "
+            "`BacksolveAdjoint(solver=diffrax.Tsit5())`, or use the default "
+            "`RecursiveCheckpointAdjoint()`."
+        )
+    raise ValueError(
+        "Presymplectic solvers need a system such as `MechanicalSystem(kinetic, "
+        f"potential)`, but got `{type(term).__name__}`. For a force without a "
+        "potential write `MechanicalSystem(kinetic, ForceField(force))`."
+    )

@@ -1,0 +1,165 @@
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jaxtyping import Array, Bool, PyTree
+
+from .._friction._base import Mechanics, Parts
+from .._friction._linear import LinearFriction
+from .._misc import (
+    all_finite,
+    check_callable,
+    match,
+    Scalar,
+    scalar_fn,
+    Time,
+    tree_add,
+    tree_dot,
+    tree_scale,
+    tree_sub,
+    tree_sum,
+)
+from ._base import AbstractKineticSystem, P, Q
+from ._mirror import AbstractMirrorMap
+from ._scaling import AbstractScaling
+from ._split import AbstractSplit, KineticSplit
+
+
+class BregmanHamiltonian(AbstractKineticSystem):
+    r"""The Bregman Hamiltonian, whose motion minimises a function $f$,
+    $H = e^{\alpha + \gamma} [ D_{h^*}(\nabla h(q) + e^{-\gamma} P, \nabla h(q))
+    + e^\beta f(q) ]$.
+
+    Equation (bregman_ham) of França, Jordan and Vidal (2021), after Wibisono, Wilson
+    and Jordan (2016), where $D_{h^*}$ is the Bregman divergence of the convex dual of
+    the mirror map $h$. The log scale is $\gamma$, so the state holds
+    $p = e^{-\gamma} P$, and with $m = \nabla h^*(\nabla h(q) + p)$ the equations of
+    motion are
+
+    $$\dot q = e^\alpha (m - q), \qquad
+    \frac{\mathrm d}{\mathrm dt} \big( \nabla h(q) + p \big)
+    = -e^{\alpha + \beta} \nabla f(q).$$
+
+    During a drift $m$ is constant and $q$ decays towards it like $e^{-\gamma}$. So the
+    drift is known in closed form for every mirror map, and splittings for any kinetic
+    energy are explicit, such as [`diffrax_presym.Strang`][] and
+    [`diffrax_presym.BlanesMoan4`][]. They need $\nabla h$ and $\nabla h^*$ but no
+    second derivatives. With [`diffrax_presym.EuclideanMirror`][] the Hamiltonian is
+    separable.
+
+    A solve fails if positions leave the domain of the mirror map, if its root find
+    fails, or if a value is not finite.
+    """
+
+    mirror_map: AbstractMirrorMap
+    objective: Callable
+    scaling: AbstractScaling
+    gradient_fn: Callable | None
+
+    def __init__(self, mirror_map, objective, scaling, *, gradient=None):
+        r"""**Arguments:**
+
+        - `mirror_map`: the mirror map $h$, for example
+            [`diffrax_presym.EntropyMirror`][].
+        - `objective`: the function to minimise, a function `f(t, q, args)` that returns
+            a scalar.
+        - `scaling`: the functions $\alpha$, $\beta$ and $\gamma$ of time, for example
+            [`diffrax_presym.PolynomialScaling`][].
+        - `gradient`: the gradient $\nabla f$, a function `gradient(t, q, args)`.
+            Defaults to automatic differentiation.
+
+        **Raises:**
+
+        `ValueError` if any of these has the wrong type, and when the solve is traced if
+        a function returns values of the wrong shape.
+        """
+        if not isinstance(mirror_map, AbstractMirrorMap):
+            raise ValueError(
+                "`mirror_map` must be a mirror map such as `EntropyMirror()`, but got "
+                f"{mirror_map!r}. For a custom function `h(q)` write "
+                "`MirrorMap(h, root_finder=...)`."
+            )
+        if not isinstance(scaling, AbstractScaling):
+            raise ValueError(
+                "`scaling` must be a scaling such as `PolynomialScaling(2.0)`, but got "
+                f"{scaling!r}. For custom functions write "
+                "`CustomScaling(alpha, beta, gamma, t0=t0, t1=t1)`."
+            )
+        check_callable(objective, "objective", "f(t, q, args)")
+        check_callable(gradient, "gradient", "gradient(t, q, args)", optional=True)
+        self.mirror_map = mirror_map
+        self.objective = objective
+        self.scaling = scaling
+        self.gradient_fn = gradient
+
+    @property
+    def parts(self) -> Parts:
+        return self.scaling.gamma.parts(Mechanics(None, has_mass=False))
+
+    @property
+    def splits(self) -> tuple[AbstractSplit, ...]:
+        linear = self.mirror_map.is_quadratic
+        return (KineticSplit(separable=linear, nystrom=linear),)
+
+    def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
+        h, step = self.mirror_map, self.mirror_map.step(q, p)
+        end = tree_sum(q, step)
+        # D_h*(grad h(q) + p, grad h(q)) is D_h(q, m).
+        divergence = h(q) - h(end) + tree_dot(tree_sum(h.gradient(q), p), step)
+        objective = scalar_fn(self.objective, "The objective")(t, q, args)
+        kinetic = tree_scale(self.scaling.rate(t), divergence)
+        potential = tree_scale(self.scaling.strength(t), objective)
+        with jax.numpy_dtype_promotion("standard"):
+            return kinetic + potential
+
+    def velocity(self, t: Time, q: Q, p: P, args: PyTree = None) -> Q:
+        return tree_scale(self.scaling.rate(t), self.mirror_map.step(q, p))
+
+    def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
+        force = self.potential_force(t, q, p, args)
+        if self.mirror_map.is_quadratic:
+            return force
+        step = self.mirror_map.step(q, p)
+        # The kinetic part depends on q too: its force is p - hess h(q) (m - q).
+        _, change = jax.jvp(self.mirror_map.gradient, (q,), (step,))
+        kinetic = self.mirror_map.project(tree_sub(p, change))
+        return tree_add(force, self.scaling.rate(t), kinetic)
+
+    def potential_force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
+        if self.gradient_fn is None:
+            objective = scalar_fn(self.objective, "The objective")
+            slope = jax.grad(objective, argnums=1)(t, q, args)
+        else:
+            slope = match(self.gradient_fn(t, q, args), q, "`gradient`", "`q`")
+        return tree_scale(-self.scaling.strength(t), self.mirror_map.project(slope))
+
+    def prepare_drift(
+        self, friction: LinearFriction | None, t: Time, h: Time, order: int
+    ) -> PyTree:
+        assert friction is not None
+        return friction.prepare(t, h, order)
+
+    def drift(
+        self,
+        friction: LinearFriction | None,
+        t: Time,
+        h: Time,
+        data: Any,
+        q: Q,
+        p: P,
+        args: PyTree,
+    ) -> tuple[Q, P]:
+        assert friction is not None
+        dq = tree_scale(-1, friction.decay(data, self.mirror_map.step(q, p)))
+        if self.mirror_map.is_quadratic:
+            return dq, friction.decay(data, p)
+        # A drift leaves grad h(q) + p constant.
+        change = tree_scale(-1, self.mirror_map.change(q, dq))
+        return dq, self.mirror_map.project(change)
+
+    def is_valid(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> Bool[Array, ""] | None:
+        valid = self.mirror_map.contains(q) & all_finite(p)
+        conditions = self.scaling.is_valid(t)
+        return valid if conditions is None else valid & conditions

@@ -1,0 +1,111 @@
+from collections.abc import Callable
+
+import jax
+from jaxtyping import Array, Bool, PyTree
+
+from .._friction._base import AbstractFriction, Parts
+from .._friction._damping import as_laws
+from .._misc import (
+    all_finite,
+    check_callable,
+    Scalar,
+    scalar_fn,
+    Time,
+    tree_scale,
+    tree_zeros,
+)
+from ._base import AbstractSystem, add_forces, P, Q
+from ._split import AbstractSplit
+
+
+class Hamiltonian(AbstractSystem):
+    r"""Any energy $E(t, q, p)$, with friction and any other force.
+
+    For energies that are not a sum $T(t, p) + V(t, q)$, which
+    [`diffrax_presym.MechanicalSystem`][] takes. Euler and leapfrog are implicit for it
+    and need a root finder; [`diffrax_presym.PresymplecticGauss`][] and
+    [`diffrax_presym.PresymplecticCoupled`][] do not. If part of its motion has a known
+    flow, such as along Kepler's orbits, pass that as a split: splittings are then
+    explicit.
+
+    !!! warning
+
+        Damping acts on the momentum $p$ of the energy, which is not always the mass
+        times the velocity. With a vector potential, $E = |p - A(q)|^2 / 2$, or in
+        general coordinates, it is not friction of the velocity, and the result depends
+        on the choice of $A$. For a charge in a magnetic field with friction use
+        [`diffrax_presym.ViscousDamping`][], for a mass matrix that depends on the
+        positions [`diffrax_presym.LagrangianSystem`][].
+    """
+
+    fn: Callable
+    friction: tuple[AbstractFriction, ...]
+    external: Callable | None
+    known: tuple[AbstractSplit, ...]
+
+    def __init__(self, energy, friction=None, *, force=None, splits=()):
+        r"""**Arguments:**
+
+        - `energy`: the energy, a function `E(t, q, p, args)` that returns a scalar.
+        - `friction`: a law of friction by rates or by place, such as
+            [`diffrax_presym.ConstantDamping`][], or a list of laws. The mass is not
+            known, so that friction per velocity has to be written as `force`. Defaults
+            to none.
+        - `force`: any further force, a function `f(t, q, v, args)` of the velocity `v`,
+            as for [`diffrax_presym.MechanicalSystem`][]. Defaults to none.
+        - `splits`: pairs of exact flows into which the motion splits, a tuple of
+            [`diffrax_presym.extend.AbstractSplit`][], the best first. Linear friction
+            is part of their drifts; they are not used with any other friction or force.
+            Defaults to none.
+
+        **Raises:**
+
+        `ValueError` if any of these is of the wrong kind, and when the solve is traced
+        if a function returns values of the wrong shape.
+        """
+        check_callable(energy, "energy", "E(t, q, p, args)")
+        check_callable(force, "force", "f(t, q, v, args)", optional=True)
+        self.fn = energy
+        self.friction = as_laws(friction)
+        self.external = force
+        self.known = tuple(splits)
+        _ = self.parts  # An error if a law does not fit the system.
+
+    @property
+    def parts(self) -> Parts:
+        each = [law.parts(self.mechanics) for law in self.friction]
+        return sum(each, Parts())  # pyright: ignore
+
+    @property
+    def splits(self) -> tuple[AbstractSplit, ...]:
+        _, *other = self.parts
+        return () if any(other) or self.external is not None else self.known
+
+    def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
+        return scalar_fn(self.fn, "The energy")(t, q, p, args)
+
+    def velocity(self, t: Time, q: Q, p: P, args: PyTree = None) -> Q:
+        return jax.grad(self.energy, argnums=2)(t, q, p, args)
+
+    def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
+        return self.velocity_and_force(t, q, p, args)[1]
+
+    def velocity_and_force(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> tuple[Q, P]:
+        slope, velocity = jax.grad(self.energy, argnums=(1, 2))(t, q, p, args)
+        forces = self.friction, self.mechanics, self.external
+        state = t, q, p, velocity, args
+        return velocity, add_forces(tree_scale(-1, slope), *forces, *state)
+
+    def friction_force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
+        state = t, q, p, self.velocity(t, q, p, args), args
+        forces = self.friction, self.mechanics, None
+        force = add_forces(tree_zeros(p), *forces, *state)
+        friction = self.fit_friction(p)
+        return force if friction is None else friction.net_force(t, force, p)
+
+    def is_valid(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> Bool[Array, ""] | None:
+        return all_finite((q, p))

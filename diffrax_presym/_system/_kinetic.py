@@ -1,0 +1,256 @@
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import lineax as lx
+from jaxtyping import Array, ArrayLike, Inexact, PyTree
+
+from .._forms import as_form, divide, multiply
+from .._friction._exponential import gauss_legendre
+from .._friction._linear import LinearFriction, MASS
+from .._misc import (
+    as_positive,
+    cast_to,
+    largest,
+    Scalar,
+    scalar_fn,
+    Time,
+    tree_dot,
+    tree_scale,
+    tree_sum,
+    tree_zeros,
+)
+
+
+class AbstractKinetic(eqx.Module):
+    """A kinetic energy `T(t, p, args)`, its velocity, and its exact flow."""
+
+    # Whether the velocity is linear in `p`, and its flow depends on time by the length
+    # of its span alone.
+    is_quadratic: eqx.AbstractVar[bool]
+    is_autonomous: eqx.AbstractVar[bool]
+
+    @abc.abstractmethod
+    def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
+        """The kinetic energy of the whole system, a scalar."""
+
+    @abc.abstractmethod
+    def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
+        r"""The velocity $\partial T / \partial p$."""
+
+    @abc.abstractmethod
+    def prepare(
+        self, friction: LinearFriction | None, t: Time, h: Time, order: int
+    ) -> PyTree:
+        """What the flow from `t` to `t + h` needs of time alone, of at least the given
+        order in `h` if it is not known in closed form."""
+
+    @abc.abstractmethod
+    def flow(
+        self,
+        friction: LinearFriction | None,
+        t: Time,
+        h: Time,
+        data: PyTree,
+        p: PyTree,
+        args: PyTree,
+    ) -> tuple[PyTree, PyTree | None]:
+        """The integral of the velocity from `t` to `t + h`, with only friction acting
+        on `p`, and the change of `p` by it."""
+
+    @abc.abstractmethod
+    def rescale(self, s: Scalar) -> "AbstractKinetic":
+        r"""The kinetic energy $T_s(p) = e^{-2s} \, T(e^s p)$, without overflow."""
+
+
+class QuadraticKinetic(AbstractKinetic):
+    r"""The kinetic energy $T(p) = \tfrac12 \, p \cdot M^{-1} p$."""
+
+    mass: PyTree[Inexact[Array, "..."]] | lx.AbstractLinearOperator | None
+
+    def __init__(self, mass=None):
+        """**Arguments:**
+
+        - `mass`: the mass, positive, in any of these forms. Defaults to `None`.
+            - `None`: unit mass.
+            - A number: the same mass for every degree of freedom.
+            - An array with as many dimensions as `p`, and broadcastable to it: a mass
+                for each degree of freedom. For `n` particles in three dimensions, with
+                `p` of shape `(n, 3)`, pass masses of shape `(n, 1)`.
+            - A square matrix, with `p` a vector: symmetric and positive definite.
+            - A pytree of the structure of `p`, whose leaves are any of the above.
+            - A `lineax.AbstractLinearOperator` acting on `p`'s space.
+
+        **Raises:**
+
+        `ValueError` if a mass is known not to be positive, or if its shape does not fit
+        `p` (when the solve is traced).
+        """
+        self.mass = as_form(mass, MASS, positive=True)
+
+    is_quadratic = True
+    is_autonomous = True
+
+    def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
+        energy = tree_dot(p, self.velocity(t, p, args))
+        return energy / 2
+
+    def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
+        return divide(self.mass, p, MASS, "p")
+
+    def momentum(self, v: PyTree) -> PyTree:
+        """The momentum $M v$ of a velocity."""
+        return multiply(self.mass, v, MASS, "q")
+
+    def prepare(self, friction, t, h, order):
+        return None if friction is None else friction.prepare(t, h, order)
+
+    def flow(self, friction, t, h, data, p, args):
+        if friction is None:
+            return tree_scale(h, self.velocity(t, p, args)), None
+        change, carried = friction.flow(data, p)
+        return self.velocity(t, carried, args), change
+
+    def rescale(self, s: Scalar) -> "QuadraticKinetic":
+        return self
+
+
+class RelativisticKinetic(AbstractKinetic):
+    r"""The kinetic energy $T(p) = c \sqrt{p \cdot p + m^2 c^2}$ of one particle.
+
+    All entries of `p` together are the momentum of one particle, whose speed never
+    exceeds $c$. As a kinetic energy for optimisation, equation (rel_ham) of França,
+    Jordan and Vidal (2021), it bounds the size of a step.
+    """
+
+    mass: Scalar
+    speed: Scalar
+
+    def __init__(self, mass: ArrayLike = 1.0, speed: ArrayLike = 1.0):
+        """**Arguments:**
+
+        - `mass`: the rest mass $m$, a positive number. Defaults to 1.
+        - `speed`: the speed of light $c$, a positive number. Defaults to 1.
+
+        **Raises:**
+
+        `ValueError` if either is known not to be positive.
+        """
+        self.mass = as_positive(mass, "`RelativisticKinetic(mass=...)`")
+        self.speed = as_positive(speed, "`RelativisticKinetic(speed=...)`")
+
+    def _scaled(self, p):
+        """The momentum and `m c` in units of the largest of them, their squares, and
+        the unit. Without units the squares would overflow."""
+        unit = largest(p)
+        rest = cast_to(self.mass, unit) * cast_to(self.speed, unit)
+        if rest.shape != ():
+            raise ValueError(
+                "`RelativisticKinetic` is the energy of one particle with one mass and "
+                f"one speed of light, but these have shape {rest.shape}. For several "
+                "particles write their energy as a function `T(t, p, args)`."
+            )
+        # Neither results nor derivatives depend on the unit.
+        rest = jnp.maximum(rest, jnp.finfo(rest.dtype).tiny)
+        unit = lax.stop_gradient(jnp.maximum(unit, rest))
+        p = tree_scale(1 / unit, p)
+        return p, tree_dot(p, p), (rest / unit) ** 2, unit
+
+    is_quadratic = False
+    is_autonomous = True
+
+    def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
+        _, square, rest, unit = self._scaled(p)
+        return cast_to(self.speed, unit) * unit * jnp.sqrt(square + rest)
+
+    def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
+        p, square, rest, unit = self._scaled(p)
+        return tree_scale(cast_to(self.speed, unit) / jnp.sqrt(square + rest), p)
+
+    def prepare(self, friction, t, h, order):
+        return prepare_quadrature(friction, t, h, order)
+
+    def flow(self, friction, t, h, data, p, args):
+        if friction is None:
+            return tree_scale(h, self.velocity(t, p, args)), None
+        return integrate(self.velocity, friction, t, h, data, p, args)
+
+    def rescale(self, s: Scalar) -> "RelativisticKinetic":
+        speed = self.speed * cast_to(jnp.exp(-s), self.speed)
+        return eqx.tree_at(lambda k: k.speed, self, speed)
+
+
+class CallableKinetic(AbstractKinetic):
+    """Any function `T(t, p, args)` as a kinetic energy, differentiated by JAX."""
+
+    fn: Callable
+    is_quadratic = False
+    is_autonomous = True
+
+    def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
+        return self.fn(t, p, args)
+
+    def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
+        return jax.grad(scalar_fn(self.fn, "The kinetic energy"), argnums=1)(t, p, args)
+
+    def prepare(self, friction, t, h, order):
+        return prepare_quadrature(friction, t, h, order)
+
+    def flow(self, friction, t, h, data, p, args):
+        return integrate(self.velocity, friction, t, h, data, p, args)
+
+    def rescale(self, s: Scalar) -> "CallableKinetic":
+        def rescaled(t, p, args):
+            energy = self.fn(t, tree_scale(jnp.exp(s), p), args)
+            return tree_scale(jnp.exp(-2 * s), energy)
+
+        return CallableKinetic(rescaled)
+
+
+def prepare_quadrature(
+    friction: LinearFriction | None, t: Time, h: Time, order: int
+) -> PyTree:
+    """The nodes and weights of the integral of a velocity, with the decay of the
+    momentum up to each node and to the end."""
+    nodes, weights = gauss_legendre(h, order)
+    if friction is None:
+        return nodes, weights, None, None
+    each = jax.vmap(lambda s: friction.prepare(t, s, order))(nodes)
+    return nodes, weights, each, friction.prepare(t, h, order)
+
+
+def integrate(
+    velocity: Callable,
+    friction: LinearFriction | None,
+    t: Time,
+    h: Time,
+    data: Any,
+    p: PyTree,
+    args: PyTree,
+) -> tuple[PyTree, PyTree | None]:
+    """The displacement under any velocity `velocity(t, p, args)`, by quadrature."""
+    nodes, weights, each, whole = data
+
+    def add(total, row):
+        s, weight, data = row
+        left = p if friction is None else tree_sum(p, friction.decay(data, p))
+        part = tree_scale(weight, velocity(t + s, left, args))
+        return tree_sum(total, part), None
+
+    total, _ = lax.scan(add, tree_zeros(p), (nodes, weights, each), unroll=True)
+    return total, None if friction is None else friction.decay(whole, p)
+
+
+def as_kinetic(kinetic) -> AbstractKinetic:
+    if isinstance(kinetic, AbstractKinetic):
+        return kinetic
+    if callable(kinetic):
+        return CallableKinetic(kinetic)
+    raise ValueError(
+        "`kinetic` must be a kinetic energy or a function `T(t, p, args)`, but got "
+        f"{kinetic!r}. For a mass write `QuadraticKinetic(mass)`."
+    )

@@ -1,0 +1,263 @@
+import abc
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import optimistix as optx
+from jaxtyping import Array, Bool, PyTree
+
+from .._misc import (
+    all_finite,
+    check_root_finder,
+    match,
+    Scalar,
+    scalar_fn,
+    tree_dot,
+    tree_sub,
+    tree_sum,
+)
+from ._kinetic import QuadraticKinetic
+
+
+class AbstractMirrorMap(eqx.Module):
+    r"""A convex function $h$, with $\nabla h$, its inverse $\nabla h^*$ and its domain.
+
+    A point $q$ has the mirror image $\nabla h(q)$, to which momenta are added. Methods
+    work relative to a point, because differences of mirror images lose most of their
+    digits in `float32`.
+    """
+
+    # Whether $\nabla h$ is linear.
+    is_quadratic: eqx.AbstractVar[bool]
+
+    @abc.abstractmethod
+    def __call__(self, q: PyTree) -> Scalar:
+        """The value $h(q)$, a scalar."""
+
+    @abc.abstractmethod
+    def gradient(self, q: PyTree) -> PyTree:
+        r"""The mirror image $\nabla h(q)$."""
+
+    @abc.abstractmethod
+    def inverse(self, w: PyTree) -> PyTree:
+        r"""The point $\nabla h^*(w)$ with mirror image $w$."""
+
+    def contains(self, q: PyTree) -> Bool[Array, ""]:
+        """Whether `q` is inside the domain. False if `q` is not finite."""
+        return all_finite(q)
+
+    # Relative to `inverse(gradient(q))`, which may differ from `q` by rounding, so that
+    # the step of a zero momentum is exactly zero.
+
+    def step(self, q: PyTree, p: PyTree) -> PyTree:
+        r"""The mirror step $\nabla h^*(\nabla h(q) + p) - q$; not finite where
+        undefined."""
+        return _step(self, q, p)
+
+    def change(self, q: PyTree, dq: PyTree) -> PyTree:
+        r"""The difference $\nabla h(q + dq) - \nabla h(q)$."""
+        return tree_sub(self.gradient(tree_sum(q, dq)), self.gradient(q))
+
+    def project(self, p: PyTree) -> PyTree:
+        """`p` without the component that has no effect, if there is one."""
+        return p
+
+
+class EuclideanMirror(AbstractMirrorMap):
+    r"""The mirror map $h(q) = \tfrac12 \, q \cdot M q$, with a linear $\nabla h$.
+
+    Bregman dynamics is then separable, the quadratic case of the paper, and every
+    scheme applies.
+    """
+
+    kinetic: QuadraticKinetic
+    is_quadratic = True
+
+    def __init__(self, mass=None):
+        """**Arguments:**
+
+        - `mass`: the mass matrix, in any form of [`diffrax_presym.QuadraticKinetic`][].
+            Defaults to `None`, unit mass.
+
+        **Raises:**
+
+        `ValueError` if a mass is known not to be positive, or if its shape does not fit
+        the state (when the solve is traced).
+        """
+        self.kinetic = QuadraticKinetic(mass)
+
+    def __call__(self, q: PyTree) -> Scalar:
+        return tree_dot(q, self.gradient(q)) / 2
+
+    def gradient(self, q: PyTree) -> PyTree:
+        return self.kinetic.momentum(q)
+
+    def inverse(self, w: PyTree) -> PyTree:
+        return self.kinetic.velocity(jnp.zeros(()), w)
+
+    def step(self, q: PyTree, p: PyTree) -> PyTree:
+        return self.inverse(p)
+
+    def change(self, q: PyTree, dq: PyTree) -> PyTree:
+        return self.gradient(dq)
+
+
+class EntropyMirror(AbstractMirrorMap):
+    r"""The negative entropy $h(q) = \sum_i q_i \log q_i$, for positive numbers.
+
+    Mirror descent with it is multiplicative. With `simplex=True` its domain is the
+    probability simplex, where $\nabla h^*$ is the softmax: positions stay positive and
+    sum to one, to rounding, without projection. A constant added to all momenta of a
+    simplex has no effect. It is removed from every force, so that the sum of momenta
+    that start at rest remains zero.
+    """
+
+    simplex: bool = eqx.field(static=True)
+    is_quadratic = False
+
+    def __init__(self, simplex: bool = False):
+        """**Arguments:**
+
+        - `simplex`: whether the last axis of every array in the state is a point of the
+            probability simplex. Defaults to `False`, any positive numbers.
+        """
+        self.simplex = simplex
+
+    def __call__(self, q: PyTree) -> Scalar:
+        # On the simplex the linear part is constant, and omitted.
+        linear = 0 if self.simplex else 1
+        image = jtu.tree_map(lambda qi: jnp.log(qi) - linear, q)
+        return tree_dot(q, image)
+
+    def gradient(self, q: PyTree) -> PyTree:
+        return jtu.tree_map(jnp.log, q)
+
+    def inverse(self, w: PyTree) -> PyTree:
+        return jtu.tree_map(jax.nn.softmax if self.simplex else jnp.exp, w)
+
+    def contains(self, q: PyTree) -> Bool[Array, ""]:
+        return _everywhere(lambda qi: (qi > 0) & jnp.isfinite(qi), q)
+
+    def step(self, q: PyTree, p: PyTree) -> PyTree:
+        def leaf(q, p):
+            if self.simplex:
+                p = p - jax.nn.logsumexp(p, axis=-1, b=q, keepdims=True)
+            return q * jnp.expm1(p)
+
+        return jtu.tree_map(leaf, q, p)
+
+    def change(self, q: PyTree, dq: PyTree) -> PyTree:
+        return jtu.tree_map(lambda q, dq: jnp.log1p(dq / q), q, dq)
+
+    def project(self, p: PyTree) -> PyTree:
+        if not self.simplex:
+            return p
+        return jtu.tree_map(lambda p: p - jnp.mean(p, axis=-1, keepdims=True), p)
+
+
+class MirrorMap(AbstractMirrorMap):
+    r"""A mirror map given by a function $h$.
+
+    $\nabla h$ is by automatic differentiation, and $\nabla h^*$ by root finding unless
+    given.
+    """
+
+    is_quadratic = False
+    fn: Callable
+    inverse_fn: Callable | None
+    domain: Callable | None
+    root_finder: optx.AbstractRootFinder | None
+    root_find_max_steps: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        h,
+        *,
+        inverse=None,
+        domain=None,
+        root_finder=None,
+        root_find_max_steps: int = 32,
+    ):
+        r"""**Arguments:**
+
+        - `h`: a strictly convex function `h(q)` that returns a scalar.
+        - `inverse`: the inverse $\nabla h^*$ of the gradient, a function `inverse(w)`.
+            Defaults to root finding.
+        - `domain`: a function `domain(q)` that returns whether `q` is inside the domain
+            of `h`. Defaults to where `h(q)` is finite.
+        - `root_finder`: an Optimistix root finder, needed if `inverse` is not given. It
+            starts from the position at the start of a step. Its tolerances limit how
+            well the structure is preserved. Defaults to `None`.
+        - `root_find_max_steps`: the maximum number of steps of a root find. Defaults to
+            32.
+
+        **Raises:**
+
+        `ValueError` if any of these has the wrong type, or if neither `inverse` nor
+        `root_finder` is given. The solve fails if a root find fails.
+        """
+        if not callable(h):
+            raise ValueError(f"`MirrorMap(h)` needs a function `h(q)`, but got {h!r}.")
+        for name, fn in {"inverse": inverse, "domain": domain}.items():
+            if fn is not None and not callable(fn):
+                raise ValueError(f"`{name}` must be a function, but got {fn!r}.")
+        if root_finder is not None:
+            check_root_finder(root_finder)
+        elif inverse is None:
+            raise ValueError(
+                "`MirrorMap` needs the inverse of the gradient of `h`, a function "
+                "`inverse(w)`, or a root finder, for example "
+                "`MirrorMap(h, root_finder=optimistix.Newton(rtol=1e-10, atol=1e-10))`."
+            )
+        self.fn = h
+        self.inverse_fn = inverse
+        self.domain = domain
+        self.root_finder = root_finder
+        self.root_find_max_steps = root_find_max_steps
+
+    def __call__(self, q: PyTree) -> Scalar:
+        return scalar_fn(self.fn, "The mirror map")(q)
+
+    def gradient(self, q: PyTree) -> PyTree:
+        return jax.grad(self.__call__)(q)
+
+    def inverse(self, w: PyTree) -> PyTree:
+        if self.inverse_fn is not None:
+            return match(self.inverse_fn(w), w, "`inverse`", "`w`")
+        return self._find(w, jtu.tree_map(jnp.ones_like, w))
+
+    def _find(self, w, guess):
+        residual = lambda q, _: tree_sub(self.gradient(q), w)
+        assert self.root_finder is not None
+        solution = optx.root_find(
+            residual,
+            self.root_finder,
+            guess,
+            max_steps=self.root_find_max_steps,
+            throw=False,
+        )
+        found = solution.result == optx.RESULTS.successful
+        return jtu.tree_map(lambda q: jnp.where(found, q, jnp.nan), solution.value)
+
+    def contains(self, q: PyTree) -> Bool[Array, ""]:
+        inside = all_finite(self(q)) if self.domain is None else self.domain(q)
+        return all_finite(q) & jnp.all(inside)
+
+    def step(self, q: PyTree, p: PyTree) -> PyTree:
+        if self.inverse_fn is not None:
+            return _step(self, q, p)
+        w = tree_sum(self.gradient(q), p)
+        return tree_sub(self._find(w, q), q)
+
+
+def _step(mirror_map: AbstractMirrorMap, q: PyTree, p: PyTree) -> PyTree:
+    image = mirror_map.gradient(q)
+    there, here = mirror_map.inverse(tree_sum(image, p)), mirror_map.inverse(image)
+    return tree_sub(there, here)
+
+
+def _everywhere(condition: Callable, q: PyTree) -> Bool[Array, ""]:
+    held = jtu.tree_map(lambda qi: jnp.all(condition(qi)), q)
+    return jtu.tree_reduce(jnp.logical_and, held, jnp.array(True))

@@ -1,0 +1,146 @@
+"""The energy of a solution, and its balance."""
+
+from collections.abc import Callable
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Inexact, PyTree
+
+from .._misc import as_time, cast_to, State, tree_dot, tree_sum
+from .._system._base import AbstractSystem
+
+
+Times = Inexact[Array, " times"]
+
+
+def energy(system: AbstractSystem, ts: Times, ys: State, args: PyTree = None) -> Times:
+    r"""The mechanical energy $E(t, q, p)$ at each saved time.
+
+    **Arguments:**
+
+    - `system`: the system of the solve.
+    - `ts`, `ys`: times and states, the `ts` and `ys` of a `diffrax.Solution`.
+    - `args`: as in `diffeqsolve`.
+
+    **Returns:**
+
+    An array with an entry for each time. Where nothing was saved (`ts` is infinite
+    beyond the last step of `SaveAt(steps=True)`) it is not finite either.
+    """
+    return _at_each(lambda t, y: system.energy(t, *y, args=args), ts, ys)
+
+
+def canonical_energy(
+    system: AbstractSystem, ts: Times, ys: State, args: PyTree = None
+) -> Times:
+    r"""The canonical energy $H = e^{\eta(t)} E(t, q, p)$, that of the paper.
+
+    It overflows where $e^{\eta}$ does.
+
+    **Arguments:**
+
+    As [`diffrax_presym.diagnostics.energy`][].
+    """
+    return _at_each(lambda t, y: system.canonical(t, *y, args=args), ts, ys)
+
+
+def energy_error(
+    system: AbstractSystem, ts: Times, ys: State, args: PyTree = None
+) -> Times:
+    r"""The error of the energy balance at each saved time.
+
+    Along the exact motion the extended Hamiltonian is constant: energy changes only by
+    friction, by other forces, and where it depends on time,
+
+    $$E(t) - E(t_0) = \int_{t_0}^t \Big( \frac{\partial E}{\partial t}
+    + v \cdot F \Big) \, \mathrm d t,$$
+
+    where $v$ is the velocity and $F$ the force that has no potential:
+    $-\dot \eta \, p$ for a damping law. The error is the left side minus the right. The
+    integral is along the exact motion from each saved state to the next time, by
+    `diffrax.Dopri8` to rounding, so that the error is that of the solution alone.
+
+    **Arguments:**
+
+    As [`diffrax_presym.diagnostics.energy`][].
+    """
+
+    def power(t, y):
+        energy = lambda t, q, p: system.energy(t, q, p, args)
+        explicit, slope, _ = jax.grad(energy, argnums=(0, 1, 2))(t, *y)
+        velocity, force = system.vf(t, y, args)
+        done = tree_dot(velocity, tree_sum(force, slope))
+        return cast_to(explicit, done) + done
+
+    done = _integral(power, system, ts, ys, args)
+    balance = energy(system, ts, ys, args)
+    return balance - balance[0] - done
+
+
+def power_lost(
+    system: AbstractSystem, ts: Times, ys: State, args: PyTree = None
+) -> Times:
+    r"""The power lost to friction at each saved time, $-v \cdot F$ with the velocity
+    $v$ and the force $F$ of all friction: $v \cdot C v$ for viscous friction.
+
+    **Arguments:**
+
+    As [`diffrax_presym.diagnostics.energy`][].
+    """
+    return _at_each(lambda t, y: _power_lost(system, t, y, args), ts, ys)
+
+
+def energy_lost(
+    system: AbstractSystem, ts: Times, ys: State, args: PyTree = None
+) -> Times:
+    """The energy lost to friction up to each saved time, the integral of
+    [`diffrax_presym.diagnostics.power_lost`][].
+
+    Along the exact motion from each saved state to the next time.
+
+    **Arguments:**
+
+    As [`diffrax_presym.diagnostics.energy`][].
+    """
+    power = lambda t, y: _power_lost(system, t, y, args)
+    return _integral(power, system, ts, ys, args)
+
+
+def _power_lost(system: AbstractSystem, t, y: State, args: PyTree):
+    velocity = system.velocity(t, *y, args)
+    return -tree_dot(velocity, system.friction_force(t, *y, args))
+
+
+def _integral(
+    power: Callable, system: AbstractSystem, ts: Times, ys: State, args: PyTree
+) -> Times:
+    """The integral up to each saved time of a function of time and state."""
+    ts = as_time(ts)
+    eps = max(float(jnp.finfo(y.dtype).eps) for y in jtu.tree_leaves(ys))
+    tolerance = 100 * eps
+
+    def one(t0, t1, y0):
+        field = lambda t, x, _: (system.vf(t, x[0], args), power(t, x[0]))
+        zero = jnp.zeros_like(power(t0, y0))
+        # Nothing was saved beyond the last step.
+        t1 = jnp.where(jnp.isfinite(t1), t1, t0)
+        sol = dfx.diffeqsolve(
+            dfx.ODETerm(field),
+            dfx.Dopri8(),
+            *(t0, t1, None, (y0, zero)),
+            stepsize_controller=dfx.PIDController(rtol=tolerance, atol=tolerance),
+            throw=False,
+        )
+        assert sol.ys is not None
+        return sol.ys[1][0]
+
+    starts = jtu.tree_map(lambda y: y[:-1], ys)
+    parts = eqx.filter_jit(jax.vmap(one))(ts[:-1], ts[1:], starts)
+    return jnp.concatenate([jnp.zeros_like(parts[:1]), jnp.cumsum(parts)])
+
+
+def _at_each(fn: Callable, ts: Times, ys: State):
+    return eqx.filter_jit(jax.vmap(fn))(as_time(ts), ys)
