@@ -10,7 +10,10 @@ from ._friction import (
     RayleighDamping as RayleighDamping,
     ViscousDamping as ViscousDamping,
 )
-from ._loop import FixedStepAdjoint as FixedStepAdjoint
+from ._loop import (
+    FixedStepAdjoint as FixedStepAdjoint,
+    StepsBetween as StepsBetween,
+)
 from ._scheme import (
     BlanesCasasRKN8 as BlanesCasasRKN8,
     BlanesMoan4 as BlanesMoan4,

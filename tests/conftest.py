@@ -164,6 +164,5 @@ collect_ignore = [
     "test_structure.py",
     "test_tableaus.py",
     "test_tuned.py",
-    "test_work_precision.py",
     "test_wrappers.py",
 ]

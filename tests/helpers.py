@@ -15,7 +15,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import diffrax_presym as dps
-from diffrax_presym._system import System
+from diffrax_presym.extend import System
 
 
 # The form of the energy that a scheme requires, i.e. the systems it is tested on.
@@ -159,7 +159,10 @@ def oscillator(gamma=0.2):
 
 def drift(hamiltonian, t, h, q, p):
     """The flow of the kinetic part, as a splitting takes it."""
-    return System(hamiltonian, None, 1).drift(t, h, (q, p), order=8)
+    system = System(hamiltonian, None, 1, (q, p))
+    split = system.split("any")
+    data = split.prepare(system, t, h, 8)
+    return split.drift(system, t, h, data, (q, p))
 
 
 # Python numbers would be compiled as constants: compile once for all times.
@@ -173,16 +176,14 @@ def step(hamiltonian, solver, t0, t1, y, args=None):
 
 @eqx.filter_jit
 def _step(hamiltonian, solver, t0, t1, y, args):
-    term = dps.HamiltonianTerm(hamiltonian)
-    carry = solver.init(term, t0, t1, y, args)
-    return solver.step(term, t0, t1, y, args, carry, made_jump=False)
+    carry = solver.init(hamiltonian, t0, t1, y, args)
+    return solver.step(hamiltonian, t0, t1, y, args, carry, made_jump=False)
 
 
 def solve(hamiltonian, solver, t0, t1, dt0, y0, args=None, **kwargs):
     """A solve of at most 4096 steps that saves the final state."""
-    term = dps.HamiltonianTerm(hamiltonian)
     t0, t1, dt0 = jnp.asarray(t0), jnp.asarray(t1), jnp.asarray(dt0)
-    return _solve(term, solver, t0, t1, dt0, y0, args, **kwargs)
+    return _solve(hamiltonian, solver, t0, t1, dt0, y0, args, **kwargs)
 
 
 _solve = eqx.filter_jit(dfx.diffeqsolve)

@@ -305,6 +305,11 @@ class LinearFriction(eqx.Module):
         """Whether what is prepared depends on the length of a span alone."""
         return all(part.is_autonomous for part in self.parts)
 
+    @property
+    def precision(self) -> float:
+        """The rounding error of a momentum, relative to it."""
+        return max(float(jnp.finfo(dtype).eps) for _, dtype in self.ravel.shapes)
+
     def prepare(self, t: Time, h: Time, order: int) -> Effects:
         """What it does from `t` to `t + h`; of at least the given order in `h` where it
         is not known in closed form."""

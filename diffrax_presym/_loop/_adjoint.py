@@ -18,7 +18,7 @@ from . import _diffrax as private
 from ._backward import Backward, Position
 from ._closures import closure_to_pytree
 from ._run import Problem, run, saved_rows
-from ._steps import Rows, Steps
+from ._steps import Rows, Steps, StepsBetween
 
 
 # The least number of steps between two kept states, of a gradient by reversal.
@@ -33,12 +33,12 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     scheme: it is a shorter step of the scheme itself. A solve whose final or saved
     states are not finite fails.
 
-    For every solver of this package, with `diffrax.ConstantStepSize` or
-    `diffrax.StepTo` and any `SaveAt`. With a constant step the steps are all equal: as
-    few as are not longer than `dt0`. (Diffrax takes the first of the length `dt0`, if
-    that does not divide the time of the solve; and its times may differ in the last
-    bit.) Events and adaptive steps are errors; use `diffrax.RecursiveCheckpointAdjoint`
-    for these.
+    For every solver of this package, with `diffrax.ConstantStepSize`,
+    [`diffrax_presym.StepsBetween`][] or `diffrax.StepTo`, and any `SaveAt`. With a
+    constant step the steps are all equal: as few as are not longer than `dt0`. (Diffrax
+    takes the first of the length `dt0`, if that does not divide the time of the solve;
+    and its times may differ in the last bit.) Events and adaptive steps are errors; use
+    `diffrax.RecursiveCheckpointAdjoint` for these.
 
     The gradient is that of the discrete solution ("discretise, then optimise"), with
     respect to `y0`, `args`, the system, and everything that a function of these or of
@@ -328,8 +328,11 @@ def _check(solver, controller, event, passed_controller_state) -> None:
     what, instead = None, "`diffrax.RecursiveCheckpointAdjoint()`"
     if not isinstance(solver, AbstractPresymplecticSolver):
         what = f"`{type(solver).__name__}`, only solvers of this package"
-    elif not isinstance(controller, dfx.ConstantStepSize | dfx.StepTo):
-        what = f"`{type(controller).__name__}`, only `ConstantStepSize` and `StepTo`"
+    elif not isinstance(controller, dfx.ConstantStepSize | dfx.StepTo | StepsBetween):
+        what = (
+            f"`{type(controller).__name__}`, only `ConstantStepSize`, `StepTo` and "
+            "`StepsBetween`"
+        )
     elif event is not None:
         what = "events"
     elif passed_controller_state:

@@ -5,17 +5,79 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._misc import as_finite, cast_to
 from .._scheme._engine import Span
 from .._system._bound import System
 
 
+class StepsBetween(dfx.AbstractStepSizeController):
+    """Equal steps between given times, each no longer than `dt0`.
+
+    For a force or friction with kinks at known times, such as a table read by
+    `jax.numpy.interp`: a step across a kink has order two at most, steps that end there
+    keep the order of the scheme. The force must be continuous. The steps between two of
+    the times are equal, and as few as are not longer than `dt0`.
+
+    !!! example
+
+        ```python
+        sol = diffeqsolve(
+            system, TunedRKN6(), t0, t1, dt0, y0,
+            stepsize_controller=StepsBetween(times), adjoint=FixedStepAdjoint(),
+        )
+        ```
+    """
+
+    times: Float[Array, " times"]
+
+    def __init__(self, times):
+        """**Arguments:**
+
+        - `times`: the times at which steps end, in any order. Those that are not
+            between `t0` and `t1` are ignored.
+
+        **Raises:**
+
+        `ValueError` if they are not a vector of finite numbers.
+        """
+        self.times = jnp.atleast_1d(as_finite(times, "`StepsBetween(times)`"))
+        if self.times.ndim > 1:
+            raise ValueError(
+                "`StepsBetween(times)` must be a vector, but got the shape "
+                f"{self.times.shape}."
+            )
+
+    def wrap(self, direction):
+        times = self.times * cast_to(direction, self.times)
+        return eqx.tree_at(lambda self: self.times, self, times)
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        if dt0 is None:
+            raise ValueError(
+                "`StepsBetween` needs the longest step. Write "
+                "`diffeqsolve(..., dt0=...)`."
+            )
+        steps = Steps(self, t0, t1, dt0)
+        return steps.time(jnp.asarray(1)), (jnp.asarray(1), steps)
+
+    def adapt_step_size(
+        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+    ):
+        n, steps = controller_state
+        state = n + 1, steps
+        return True, t1, steps.time(n + 1), False, state, dfx.RESULTS.successful
+
+
 class Steps(eqx.Module):
-    """Steps of one length, which divides the time of the solve, or prescribed ones."""
+    """Steps that are equal between given times, the ends of a solve if there are none,
+    or prescribed ones."""
 
     t0: Float[Array, ""]
     t1: Float[Array, ""]
     total: Int[Array, ""]
-    length: Float[Array, ""]  # of steps of one length
+    starts: Float[Array, " parts"]  # of the spans of equal steps
+    first: Int[Array, " parts"]  # the first step of each of them
+    length: Float[Array, " parts"]  # of its steps
     ts: Float[Array, " ends"] | None  # of prescribed steps
 
     def __init__(self, controller: dfx.AbstractStepSizeController, t0, t1, dt0):
@@ -23,40 +85,55 @@ class Steps(eqx.Module):
         if isinstance(controller, dfx.StepTo):
             self.ts = controller.ts
             self.total = jnp.asarray(len(controller.ts) - 1)
-            self.length = jnp.zeros_like(t0)
+            self.starts, self.first = t0[None], jnp.zeros(1, int)
+            self.length = jnp.zeros_like(self.starts)
             return
+        inner = controller.times if isinstance(controller, StepsBetween) else []
+        inner = jnp.clip(jnp.sort(jnp.asarray(inner, t0.dtype)), t0, t1)
+        self.starts = jnp.concatenate([t0[None], inner])
+        spans = jnp.concatenate([inner, t1[None]]) - self.starts
         # As few equal steps as are not longer than `dt0`, but for rounding.
         eps, most = float(jnp.finfo(t0.dtype).eps), jnp.iinfo(int).max // 2
-        number = jnp.ceil((t1 - t0) / dt0 * (1 - 2 * eps))
-        finite = jnp.isfinite(number)
+        numbers = jnp.ceil(spans / dt0 * (1 - 2 * eps))
+        finite = jnp.isfinite(numbers)
         # A time that is not finite is never reached, with steps of the given length.
-        self.total = jnp.where(finite, number, 0).astype(int)
-        self.total = jnp.where(finite, self.total, most)
-        several = jnp.where(finite, jnp.maximum(number, 1), 1)
-        self.length = jnp.where(finite, (t1 - t0) / several, dt0)
+        counts = jnp.where(finite, jnp.where(finite, numbers, 0).astype(int), most)
+        several = jnp.where(finite, jnp.maximum(numbers, 1), 1)
+        self.length = jnp.where(finite, spans / several, dt0)
+        ends = jnp.cumsum(counts)
+        self.first, self.total = ends - counts, ends[-1]
 
     @property
     def are_equal(self) -> bool:
-        return self.ts is None
+        return self.ts is None and len(self.starts) == 1
+
+    def _part(self, n: Int[Array, "..."]) -> Int[Array, "..."]:
+        if len(self.starts) == 1:
+            return jnp.zeros_like(n)
+        return jnp.searchsorted(self.first, n, side="right").astype(int) - 1
 
     def time(self, n: Int[Array, "..."]) -> Float[Array, "..."]:
         """The start of step `n`."""
         if self.ts is not None:
             return self.ts[n]
-        t = self.t0 + self.length * n.astype(self.t0.dtype)
+        k = self._part(n)
+        t = self.starts[k] + self.length[k] * (n - self.first[k]).astype(self.t0.dtype)
         return jnp.where(n >= self.total, self.t1, t)
 
     def span(self, system: System, n: Int[Array, ""]) -> Span:
         """Step `n`, in physical time."""
         t0, t1 = system.time(self.time(n)), system.time(self.time(n + 1))
-        return Span(t0, t1, system.time(self.length) if self.are_equal else t1 - t0)
+        if self.ts is not None:
+            return Span(t0, t1, t1 - t0)
+        return Span(t0, t1, system.time(self.length[self._part(n)]))
 
     def containing(self, ts: Float[Array, " times"]) -> Int[Array, " times"]:
         """The step in which each time is, its end included, its start not."""
         if self.ts is not None:
             return jnp.searchsorted(self.ts[1:], ts).astype(int)
-        length = jnp.where(self.length > 0, self.length, 1)
-        n = jnp.ceil((ts - self.t0) / length).astype(int) - 1
+        k = jnp.searchsorted(self.starts[1:], ts).astype(int)
+        length = jnp.where(self.length > 0, self.length, 1)[k]
+        n = self.first[k] + jnp.ceil((ts - self.starts[k]) / length).astype(int) - 1
         # The quotient is rounded.
         n = jnp.where(self.time(n) >= ts, n - 1, n)
         n = jnp.where(self.time(n + 1) < ts, n + 1, n)

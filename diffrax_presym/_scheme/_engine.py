@@ -7,6 +7,7 @@ traverse the same list.
 """
 
 import abc
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeAlias
 
@@ -157,12 +158,27 @@ def _distinct(moves: Moves, system: System, span: Span, backward: bool) -> PyTre
     def column(i: int, move: Moves) -> PyTree:
         rows, _ = moves.distinct(i, system.prepares_once)
         one = lambda *row: _distinct(move, system, span.part(*row), backward)
+        if not backward and np.any(rows[:, 1] < rows[:, 0]):
+            one = lambda *row: _unless_amplified(
+                system, part := span.part(*row), _distinct(move, system, part, False)
+            )
         if len(rows) == 1:
             row = one(*rows[0].tolist())
             return jtu.tree_map(lambda x: jnp.expand_dims(x, 0), row)
         return jax.vmap(one)(*(cast_to(x, span.h) for x in rows.T))
 
     return [column(i, move) for i, move in enumerate(moves.moves)]
+
+
+def _unless_amplified(system: System, span: Span, data: PyTree) -> PyTree:
+    """What was prepared for a stage, not finite if the stage goes back in time and
+    friction amplifies rounding errors there beyond half of the digits."""
+    if system.friction is None:
+        return data
+    friction = lax.stop_gradient(system.friction)
+    grown = friction.amplification(span.t1, -span.h)
+    bad = grown > 1 / math.sqrt(friction.precision)
+    return jtu.tree_map(lambda x: jnp.where(bad, jnp.nan, x), data)
 
 
 def _expand(moves: Moves, system: System, data: PyTree) -> PyTree:

@@ -7,8 +7,19 @@ from ._energy import (
     energy_lost as energy_lost,
     power_lost as power_lost,
 )
+from ._plot import (
+    plot_convergence as plot_convergence,
+    plot_energy as plot_energy,
+    plot_phase as plot_phase,
+    plot_work_precision as plot_work_precision,
+)
 from ._structure import (
     convergence_order as convergence_order,
     structure_defect as structure_defect,
     volume_defect as volume_defect,
+)
+from ._work_precision import (
+    work_precision as work_precision,
+    WorkPrecision as WorkPrecision,
+    WorkPrecisionRun as WorkPrecisionRun,
 )

@@ -1,0 +1,234 @@
+"""Error against time, of solves that a user gives."""
+
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from .._step_size._choose import check_times, check_tolerance
+from .._step_size._convergence import scaled_error, Solution
+
+
+Solve = Callable[[Any], Any]
+
+
+class WorkPrecisionRun(NamedTuple):
+    """One solve of [`diffrax_presym.diagnostics.work_precision`][].
+
+    **Attributes:**
+
+    - `name`: the name of the solve.
+    - `error`: the largest error of a saved entry, over `atol + rtol * size`: at most
+        one where the tolerance is reached.
+    - `seconds`: the time of a call, a median.
+    - `steps`: the number of steps, rejected ones included.
+    - `setting`: the `dt0`, or the tolerance of an adaptive solve.
+    """
+
+    name: str
+    error: float
+    seconds: float
+    steps: int
+    setting: float
+
+
+class WorkPrecision(NamedTuple):
+    """The measurements of [`diffrax_presym.diagnostics.work_precision`][].
+
+    **Attributes:**
+
+    - `runs`: a [`diffrax_presym.diagnostics.WorkPrecisionRun`][] for each solve and
+        each of its steps or tolerances.
+    - `reference`: the name of the solve whose finest solution the errors refer to.
+    """
+
+    runs: tuple[WorkPrecisionRun, ...]
+    reference: str
+
+    def fastest(self, error: float = 1.0) -> WorkPrecisionRun:
+        """The fastest run whose error is at most so many times the tolerance.
+
+        **Raises:**
+
+        `ValueError` if there is none.
+        """
+        good = [run for run in self.runs if run.error <= error]
+        if not good:
+            raise ValueError(f"No solve has an error of {error} times the tolerance.")
+        return min(good, key=lambda run: run.seconds)
+
+    def __str__(self) -> str:
+        width = max(len(run.name) for run in self.runs)
+        lines = [f"{'solve':{width}}  {'steps':>8}  {'error':>8}  {'time (ms)':>9}"]
+        lines += [
+            f"{run.name:{width}}  {run.steps:8}  {run.error:8.1e}  "
+            f"{1e3 * run.seconds:9.3f}"
+            for run in self.runs
+        ]
+        lines.append(f"errors over the tolerance, against {self.reference!r}")
+        return "\n".join(lines)
+
+
+def work_precision(
+    solves: Mapping[str, Solve],
+    t0,
+    t1,
+    *,
+    rtol: float,
+    atol: float,
+    adaptive: Mapping[str, Solve] | None = None,
+    decades: int = 2,
+    repeats: int = 5,
+    max_steps: int = 1_000_000,
+) -> WorkPrecision:
+    """Speed against error: the time of each solve, at errors around a tolerance.
+
+    Each solve is repeated with more and more steps, until it converges. The errors of
+    all are measured against one reference, the converged solution with which the most
+    solves agree: a solve that converges to something else is never the fastest.
+
+    !!! example
+
+        ```python
+        system = MechanicalSystem(QuadraticKinetic(), QuadraticPotential())
+        y0 = jnp.ones(1), jnp.zeros(1)
+
+        def solve_by(solver):
+            return jax.jit(
+                lambda dt0: diffeqsolve(
+                    system, solver, 0.0, 20.0, dt0, y0, max_steps=None
+                )
+            )
+
+        solves = {"TunedRKN6": solve_by(TunedRKN6()), "Dopri8": solve_by(dfx.Dopri8())}
+        result = work_precision(solves, 0.0, 20.0, rtol=1e-6, atol=1e-6)
+        print(result, result.fastest().name)
+        ```
+
+    **Arguments:**
+
+    - `solves`: names, and functions of the step `dt0` that return a `diffrax.Solution`,
+        as for [`diffrax_presym.choose_step`][]. They should be jitted.
+    - `t0`, `t1`: the start and the end of the solves.
+    - `rtol`, `atol`: the tolerance, for each entry of what is saved.
+    - `adaptive`: names, and functions of a relative tolerance that return a
+        `diffrax.Solution`. Defaults to none.
+    - `decades`: how many powers of ten around the tolerance are measured.
+    - `repeats`: the number of calls of which the median time is taken.
+    - `max_steps`: the largest number of steps of a solve.
+
+    **Returns:**
+
+    A [`diffrax_presym.diagnostics.WorkPrecision`][], which prints as a table;
+    [`diffrax_presym.diagnostics.plot_work_precision`][] draws it.
+
+    **Raises:**
+
+    `ValueError` if an argument is not valid; `RuntimeError` if no solve converges.
+    """
+    t0, t1 = check_times(t0, t1, "work_precision")
+    tolerance = tuple(
+        check_tolerance(x, f"work_precision({name}=...)")
+        for name, x in (("rtol", rtol), ("atol", atol))
+    )
+    if not solves or not any(tolerance):
+        raise ValueError(
+            "`work_precision` needs at least one solve and a positive tolerance: "
+            "`work_precision({name: solve}, t0, t1, rtol=1e-6, atol=1e-6)`."
+        )
+    span = t1 - t0
+    run = lambda solve, n: Solution.of(n, solve(span / n))
+    goal = 10.0**-decades
+    finest = {}
+    for name, solve in solves.items():
+        found = _converged(lambda n, f=solve: run(f, n), tolerance, goal, max_steps)
+        if found is not None:
+            finest[name] = found
+    if not finest:
+        raise RuntimeError(
+            f"No solve converges to {goal:.0e} of the tolerance with up to {max_steps} "
+            "steps. Use a larger tolerance, or a scheme of higher order."
+        )
+    reference = _agreed(finest, tolerance)
+    exact = finest[reference].leaves
+    window = lambda error: goal / 10 <= error <= 1 / goal
+    measured = []
+    for name, solve in solves.items():
+        for n in _ladder(max_steps):
+            solution = run(solve, n)
+            error = _error(solution, exact, tolerance)
+            if window(error):
+                measured.append((name, error, solution.steps, span / n, solve))
+            if error < goal:
+                break
+    for name, solve in (adaptive or {}).items():
+        for k in range(2 * (2 * decades + 2) + 1):
+            level = tolerance[0] / goal * 10 ** (-k / 2)
+            solution = Solution.of(0, solve(level))
+            error = _error(solution, exact, tolerance)
+            if window(error):
+                measured.append((name, error, solution.steps, level, solve))
+            if error < goal:
+                break
+    calls = [(solve, setting) for *_, setting, solve in measured]
+    runs = [
+        WorkPrecisionRun(name, error, seconds, steps, setting)
+        for (name, error, steps, setting, _), seconds in zip(
+            measured, _medians(calls, repeats), strict=True
+        )
+    ]
+    return WorkPrecision(tuple(runs), reference)
+
+
+def _ladder(max_steps: int):
+    """Numbers of steps, each about the root of two times the last, mostly odd: even
+    ones might all see the same phase of a periodic force."""
+    number = 5.0
+    while number <= max_steps:
+        yield round(number) | 1
+        number *= 2**0.5
+
+
+def _error(solution: Solution, exact: list[np.ndarray], tolerance) -> float:
+    if not solution.finite:
+        return np.inf
+    return scaled_error(solution.leaves, exact, *tolerance)
+
+
+def _converged(
+    solve: Callable[[int], Solution], tolerance, goal: float, max_steps: int
+) -> Solution | None:
+    """The first solution that differs from that of half as many steps by less than a
+    tenth of the goal."""
+    last, n = None, 5
+    while n <= max_steps:
+        solution = solve(n)
+        if last is not None and last.finite:
+            if _error(solution, last.leaves, tolerance) < goal / 10:
+                return solution
+        last, n = solution, 2 * n + 1
+    return None
+
+
+def _agreed(finest: Mapping[str, Solution], tolerance) -> str:
+    """The solve with which the most others agree, of these that with the most steps."""
+    agree = lambda a, b: _error(a, b.leaves, tolerance) <= 1
+    votes = {
+        name: sum(agree(other, solution) for other in finest.values())
+        for name, solution in finest.items()
+    }
+    return max(finest, key=lambda name: (votes[name], finest[name].steps))
+
+
+def _medians(calls: list[tuple[Solve, float]], repeats: int) -> list[float]:
+    """The median time of each call, all of them alternately."""
+    seconds: list[list[float]] = [[] for _ in calls]
+    for _ in range(repeats):
+        for (solve, setting), times in zip(calls, seconds, strict=True):
+            start = time.perf_counter()
+            jax.block_until_ready(solve(setting))
+            times.append(time.perf_counter() - start)
+    return [statistics.median(times) for times in seconds]
