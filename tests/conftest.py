@@ -159,7 +159,6 @@ collect_ignore = [
     "test_order.py",
     "test_paper_experiments.py",
     "test_protections.py",
-    "test_silent_errors.py",
     "test_step_density.py",
     "test_structure.py",
     "test_tableaus.py",

@@ -50,7 +50,8 @@ class Parts(NamedTuple):
     forces: tuple[Any, ...] = ()  # part of the force alone
 
     def __add__(self, other: "Parts") -> "Parts":  # pyright: ignore
-        return Parts(*(x + y for x, y in zip(self, other, strict=True)))
+        both = zip(self, other, strict=True)
+        return Parts(*(x + y for x, y in both))  # pyright: ignore
 
 
 class AbstractFriction(eqx.Module):

@@ -15,7 +15,7 @@ from .._misc import as_parameter, cast_to, Scalar, Time
 from ._base import AbstractFriction, Mechanics, Parts
 from ._damping import as_numbers, Numbers
 from ._exponential import expm1, expm1_ratio, log1p_ratio
-from ._linear import MASS
+from ._rates import MASS
 from ._viscous import needs_mass
 
 

@@ -5,7 +5,7 @@ from jaxtyping import PyTree
 from .._forms import multiply
 from .._misc import Time, tree_scale
 from ._base import AbstractFriction, Local, Mechanics, Parts
-from ._linear import DAMPING
+from ._rates import DAMPING
 
 
 class PositionDamping(AbstractFriction):

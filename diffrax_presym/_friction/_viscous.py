@@ -1,6 +1,7 @@
 """Friction by coefficients, the force per velocity."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -11,8 +12,8 @@ from .._forms import as_form, is_operator, multiply
 from .._misc import as_finite, cast_to, Scalar, Time, tree_scale, tree_sum
 from ._base import AbstractFriction, Form, Linear, Local, Mechanics, Parts
 from ._damping import AbstractDamping, as_friction
-from ._linear import COEFFICIENTS
 from ._log_scale import Linear as LinearScale
+from ._rates import COEFFICIENTS
 
 
 _FORMS = (
@@ -110,17 +111,19 @@ class ViscousDamping(AbstractFriction):
         return callable(self.coefficients) and not is_operator(self.coefficients)
 
     def parts(self, mechanics: Mechanics) -> Parts:
+        coefficients: Any = self.coefficients
         if mechanics.mass_varies:
             return Parts(forces=(self,))
         needs_mass(mechanics, "ViscousDamping")
         if self.is_local:
-            return Parts(local=(Local(self.coefficients, per_velocity=True),))
+            return Parts(local=(Local(coefficients, per_velocity=True),))
         terms = ((LinearScale(), None),) if self.law is None else self.law.terms
-        scaled = lambda factor: _scaled(factor, self.coefficients)
+        scaled = lambda factor: _scaled(factor, coefficients)
         return Parts(tuple(Linear(x, scaled(factor), True) for x, factor in terms))
 
     def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
-        form = self.coefficients(t, q, args) if self.is_local else self.coefficients
+        form: Any = self.coefficients
+        form = form(t, q, args) if self.is_local else form
         force = tree_scale(-1, multiply(form, v, COEFFICIENTS, "v"))
         return force if self.law is None else tree_scale(self.law.rate(t), force)
 

@@ -1,7 +1,6 @@
 """The loop for steps that are known beforehand, as an adjoint of Diffrax."""
 
-import math
-from typing import Any, Literal
+from typing import Literal
 
 import diffrax as dfx
 import equinox as eqx
@@ -9,20 +8,16 @@ import equinox.internal as eqxi
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, PyTree
 
-from .._misc import all_finite, as_positive, largest, tree_sub
+from .._misc import as_positive
 from .._scheme._base import AbstractPresymplecticSolver
 from .._system._bound import bind
 from . import _diffrax as private
-from ._backward import Backward, Position
+from ._backward import Backward
 from ._closures import closure_to_pytree
+from ._kept import kept_steps, pull_back
 from ._run import Problem, run, saved_rows
 from ._steps import Rows, Steps, StepsBetween
-
-
-# The least number of steps between two kept states, of a gradient by reversal.
-_APART = 16
 
 
 class FixedStepAdjoint(dfx.AbstractAdjoint):
@@ -111,151 +106,22 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         # Closures of functions are differentiated too.
         system, fns = closure_to_pytree((system, fns))
         steps = Steps(stepsize_controller, t0, t1, dt0)
-        dense_ts, dense_infos = private.dense_buffers(init_state)
-        bare = [
-            eqx.tree_at(lambda x: x.fn, sub, None, is_leaf=lambda x: x is None)
-            for sub in subs
-        ]
+        without_fn = lambda sub: eqx.tree_at(lambda x: x.fn, sub, None, is_leaf=_none)
         problem = Problem(
             system,
             fns,
             (y, carry),
             steps,
             [Rows(sub, steps, max_steps) for sub in subs],
-            bare,
+            list(map(without_fn, subs)),
             solver,
             max_steps,
-            dense_infos,
+            private.dense_buffers(init_state)[1],
             progress_meter,
             private.meter_of(init_state),
         )
-        buffers = private.saved_buffers(init_state, structure)
-        out, counts = eqx.partition(
-            _solve((problem, buffers), self), eqx.is_inexact_array
-        )
-        # To JAX all outputs of a custom rule have derivatives, even integers.
-        end, saved, dense, n, result, meter = eqx.combine(
-            out, eqxi.nondifferentiable_backward(counts)
-        )
-        if dense is not None:
-            index = jnp.arange(len(dense_ts))
-            dense = jnp.where(index <= n, steps.time(index), dense_ts), dense
-        final = private.final_state(
-            private.without_start(init_state),
-            structure,
-            y=end[0],
-            solver_state=end[1],
-            t=steps.time(n),
-            steps=n,
-            result=result,
-            meter=meter,
-            saved=saved,
-            dense=dense,
-        )
+        final = _final_state(problem, self, init_state, structure)
         return final, {"order": solver.order(terms)}
-
-    # Which states are kept for a gradient.
-
-    def _limit(self, y: PyTree) -> tuple[float, float]:
-        """The largest allowed error of a recomputed state, and that of rounding."""
-        eps = float(max(jnp.finfo(x.dtype).eps for x in jtu.tree_leaves(y)))
-        return eps ** (2 / 3) if self.tol is None else self.tol, eps
-
-    def _keep(self, problem: Problem) -> tuple[Array, Any]:
-        """The steps whose starting states are kept, in order; those that are not are
-        after the last step. And the number of steps between them, if it is known."""
-        if self.gradient == "checkpoints":
-            most = problem.max_steps
-            if most is None:
-                raise ValueError(
-                    'A gradient by `FixedStepAdjoint("checkpoints")` needs to know how '
-                    "many steps to allocate memory for. Pass `diffeqsolve(..., "
-                    'max_steps=...)`, or use `FixedStepAdjoint("reversal")`.'
-                )
-            number = self.checkpoints
-            parts = math.isqrt(most) if number is None else number + 1
-            length = max(-(-most // max(parts, 1)), 1)
-            places = jnp.arange(max(-(-most // length), 1)) * length
-            return _places(places, problem.last), length
-        most = (128 if self.checkpoints is None else self.checkpoints) + 1
-        first, system = _first_invertible(problem), problem.system
-        steps = problem.last - first
-        parts = -(-steps // _APART)
-        if system.friction is not None:
-            # Each part may amplify rounding up to the limit.
-            t0, t1 = (system.time(problem.steps.time(n)) for n in (first, problem.last))
-            limit, eps = self._limit(problem.start[0])
-            amplified = jnp.log(system.friction.amplification(t0, t1 - t0))
-            needed = 2 * amplified / max(math.log(limit / eps), 1)
-            # Infinite or undefined amplification needs as many as there are.
-            needed = jnp.where(needed < most, needed, most)
-            parts = jnp.maximum(parts, jnp.ceil(needed).astype(parts.dtype))
-        parts = jnp.clip(parts, 1, most)
-        places = first + jnp.arange(most) * -(-steps // parts)
-        return _places(places, problem.last), None
-
-    def _back(self, backward: Backward) -> Position:
-        places, length = self._keep(backward.problem)
-        if length is None:
-            return self._by_reversal(backward, places)
-        return _by_checkpoints(backward, places, length)
-
-    def _by_reversal(self, backward: Backward, places: Array) -> Position:
-        problem, trace = backward.problem, backward.trace
-        at, pulls = backward.end()
-        # Positions and momenta are compared in units of their largest values. The
-        # solver state may be pure rounding, and is not compared.
-        units = jtu.tree_map(
-            lambda x, y: jnp.maximum(largest(x), largest(y)),
-            *(problem.start[0], at.point[0]),
-        )
-
-        def size(y):
-            scaled = jtu.tree_map(
-                lambda x, u: (largest(x) / jnp.where(u > 0, u, 1)).astype(float),
-                *(y, units),
-            )
-            return jtu.tree_reduce(jnp.maximum, scaled)
-
-        def part(x):
-            at, worst, j = x
-            j, end = j - 1, at.point[0]
-            known = jtu.tree_map(lambda x: x[j], trace.kept)
-            at = backward.back_to(at, pulls, places[j], lambda n: None)
-            miss = size(tree_sub(at.point[0], known[0]))
-            miss = miss / jnp.maximum(size(known[0]), size(end))
-            at = eqx.tree_at(lambda at: at.point, at, known)
-            return at, jnp.maximum(worst, miss), j
-
-        parts = jnp.maximum(jnp.sum(places < trace.n), 1)
-        zero = jnp.zeros_like(size(at.point[0]))
-        at, miss, _ = lax.while_loop(lambda x: x[2] > 0, part, (at, zero, parts))
-        if _is_singular(problem) is not None:
-            # The first step cannot be inverted, and is pulled back from its start.
-            redo = lambda at: backward.step(at, problem.start)
-            at = lax.cond((places[0] > 0) & (at.n > 0), redo, lambda at: at, at)
-            at = backward.back_to(at, pulls, jnp.asarray(0), lambda n: None)
-        at = backward.start(at)
-        undoable = backward.scheme.undoable
-        if undoable is not None:
-            at = eqx.error_if(
-                at,
-                ~undoable(problem.start[1], trace.end[1]),
-                "`FixedStepAdjoint` cannot undo this solve: its steps change in "
-                "length, or its friction abruptly, and there a multistep method starts "
-                "again without its history. Use steps of one length, or "
-                '`FixedStepAdjoint("checkpoints")`.',
-            )
-        # A solve that diverged has a gradient of NaN anyway.
-        missed = ~(miss <= self._limit(at.point[0])[0]) & all_finite(trace.end[0])
-        return eqx.error_if(
-            at,
-            missed,
-            "`FixedStepAdjoint` recomputed the states of this solve with an error "
-            "beyond its `tol`: damping or instability amplifies rounding backwards in "
-            "time. Keep more states, `FixedStepAdjoint(checkpoints=...)`, or write "
-            '`FixedStepAdjoint("checkpoints")`.',
-        )
 
 
 FixedStepAdjoint.__init__.__doc__ = r"""**Arguments:**
@@ -278,52 +144,6 @@ exceeds `tol`.
 """
 
 
-def _places(places: Array, last: Array) -> Array:
-    return jnp.where((places < last) | (jnp.arange(len(places)) == 0), places, last + 1)
-
-
-def _by_checkpoints(backward: Backward, places: Array, length: int) -> Position:
-    def part(x):
-        at, j = x
-        j = j - 1
-        first = places[j]
-        known = jtu.tree_map(lambda x: x[j], backward.trace.kept)
-        stack = lambda x: jnp.broadcast_to(x, (length, *jnp.shape(x)))
-
-        def again(n, x):
-            point, points = x
-            point = backward.advance(n, point)
-            put = lambda xs, x: lax.dynamic_update_index_in_dim(xs, x, n + 1 - first, 0)
-            return point, jtu.tree_map(put, points, point)
-
-        begin = known, jtu.tree_map(stack, known)
-        _, points = lax.fori_loop(first, at.n - 1, again, begin)
-        start = lambda n: jtu.tree_map(lambda x: x[n - first], points)
-        return backward.back_to(at, pulls, first, start), j
-
-    at, pulls = backward.end()
-    parts = jnp.maximum(jnp.sum(places < backward.trace.n), 1)
-    at, _ = lax.while_loop(lambda x: x[1] > 0, part, (at, parts))
-    return backward.start(at)
-
-
-def _is_singular(problem: Problem) -> Array | None:
-    """Whether friction is infinite at the start; `None` if it never is."""
-    friction, system = problem.system.friction, problem.system
-    if friction is None:
-        return None
-    return friction.is_singular(system.time(problem.steps.t0))
-
-
-def _first_invertible(problem: Problem) -> Array:
-    """The first step that can be inverted: one from a singularity of the friction loses
-    `p`."""
-    singular = _is_singular(problem)
-    if singular is None:
-        return jnp.asarray(0)
-    return jnp.where(singular & (problem.last > 0), 1, 0)
-
-
 def _check(solver, controller, event, passed_controller_state) -> None:
     what, instead = None, "`diffrax.RecursiveCheckpointAdjoint()`"
     if not isinstance(solver, AbstractPresymplecticSolver):
@@ -343,6 +163,37 @@ def _check(solver, controller, event, passed_controller_state) -> None:
         )
 
 
+_none = lambda x: x is None
+
+
+def _final_state(problem: Problem, adjoint: FixedStepAdjoint, init_state, structure):
+    """Diffrax's state at the end of the solve."""
+    buffers = private.saved_buffers(init_state, structure)
+    out, counts = eqx.partition(
+        _solve((problem, buffers), adjoint), eqx.is_inexact_array
+    )
+    # To JAX all outputs of a custom rule have derivatives, even integers.
+    end, saved, dense, n, result, meter = eqx.combine(
+        out, eqxi.nondifferentiable_backward(counts)
+    )
+    if dense is not None:
+        dense_ts, _ = private.dense_buffers(init_state)
+        index = jnp.arange(len(dense_ts))
+        dense = jnp.where(index <= n, problem.steps.time(index), dense_ts), dense
+    return private.final_state(
+        private.without_start(init_state),
+        structure,
+        y=end[0],
+        solver_state=end[1],
+        t=problem.steps.time(n),
+        steps=n,
+        result=result,
+        meter=meter,
+        saved=saved,
+        dense=dense,
+    )
+
+
 @eqx.filter_custom_vjp
 def _solve(inputs, adjoint: FixedStepAdjoint):
     problem, buffers = inputs
@@ -353,7 +204,7 @@ def _outputs(problem: Problem, buffers, out):
     """What Diffrax needs of a solve."""
     progress, result, values = out
     saved = [
-        saved_rows(problem, i, *buffer, rows, progress)
+        saved_rows(problem, i, buffer, rows, progress)
         for i, (buffer, rows) in enumerate(zip(buffers, values, strict=True))
     ]
     return progress.point, saved, progress.dense, progress.n, result, progress.meter
@@ -369,7 +220,7 @@ def _solve_fwd(perturbed, inputs, adjoint: FixedStepAdjoint):
             "(`t0`, `t1`, `dt0`, `ts`) or to the solver. Use "
             "`diffrax.RecursiveCheckpointAdjoint()` instead."
         )
-    keep, _ = adjoint._keep(problem)
+    keep, _ = kept_steps(adjoint, problem)
     out, trace = run(problem, keep)
     return _outputs(problem, buffers, out), trace
 
@@ -390,10 +241,8 @@ def _solve_bwd(trace, bars, perturbed, inputs, adjoint: FixedStepAdjoint):
         dense_bar = zeros(problem.dense, dense_bar)
     wanted = moved.system, moved.fns
     backward = Backward(problem, trace, wanted, (saved_bars, carry_bar, dense_bar))
-    at = adjoint._back(backward)
+    at = pull_back(adjoint, backward)
     none = lambda tree: jtu.tree_map(lambda _: None, tree)
     where = lambda x: (x.system, x.fns, x.start)
-    gradient = eqx.tree_at(
-        where, none(problem), (*at.gradient, at.bar), is_leaf=lambda x: x is None
-    )
+    gradient = eqx.tree_at(where, none(problem), (*at.gradient, at.bar), is_leaf=_none)
     return gradient, none(buffers)

@@ -122,7 +122,7 @@ class Backward(eqx.Module):
         `start` gives the state at the start of a step, if it is known.
         """
 
-        def due(at: Position) -> list[Array]:
+        def due(at: Position) -> list[Any]:
             pairs = zip(self.problem.rows, at.left, strict=True)
             return [
                 jnp.where(left > 0, rows.stop[left - 1], -1) if len(rows) else -1
@@ -154,7 +154,7 @@ class Backward(eqx.Module):
 
         return lax.while_loop(more, stop, at)
 
-    def step(self, at: Position, start: Point | None = None) -> Position:
+    def step(self, at: Position, start: Any = None) -> Position:
         """One step back; `start` is the state at its start, if known."""
         n, system, moves = at.n - 1, self.problem.system, self.scheme.moves
         span, (wanted, _) = self.span(n), self.wanted
@@ -220,7 +220,7 @@ class Backward(eqx.Module):
 
         def output(moved, start):
             parameters = eqx.combine(moved, fixed)
-            saved, _ = self.problem.output(i, *parameters, j, start)
+            saved, _ = self.problem.output(i, parameters, j, start)
             return eqx.filter(saved, eqx.is_inexact_array)
 
         bar = self._row(i, int(self.problem.subs[i].t0) + j, True)
@@ -233,7 +233,7 @@ class Backward(eqx.Module):
 
         def outputs(moved, starts):
             parameters = eqx.combine(moved, fixed)
-            saved, _ = problem.outputs(i, *parameters, starts, n)
+            saved, _ = problem.outputs(i, parameters, starts, n)
             return eqx.filter(saved, eqx.is_inexact_array)
 
         reached, first = rows.reached(n), int(problem.subs[i].t0)

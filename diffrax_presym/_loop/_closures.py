@@ -2,6 +2,7 @@
 
 import inspect
 from types import CellType, FunctionType
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -21,7 +22,7 @@ def closure_to_pytree(tree: PyTree) -> PyTree:
 class _Closure(eqx.Module):
     """A function, and what it closes over, from which it can be rebuilt."""
 
-    original: FunctionType = eqx.field(static=True)
+    original: Any = eqx.field(static=True)
     cells: list[PyTree]
     defaults: tuple[PyTree, ...] | None
 

@@ -28,7 +28,7 @@ def saved_buffers(state, structure) -> list[tuple[Array, PyTree]]:
     return [(save.ts, save.ys) for save in structure.flatten_up_to(state.save_state)]
 
 
-def dense_buffers(state) -> tuple[Array | None, PyTree]:
+def dense_buffers(state) -> tuple[Any, PyTree]:
     """The times and the data of dense output to fill; `None` without dense output."""
     return state.dense_ts, state.dense_infos
 

@@ -32,6 +32,9 @@ from .._system._bound import NONFINITE, System
 from ._steps import Rows, Steps
 
 
+# What outputs are differentiated with respect to.
+Parameters = tuple[System, list[Callable]]
+
 # Numbers in a state from which the outputs between steps are computed one by one,
 # rather than all at once, which would take more memory than it saves time.
 _LARGE = 512
@@ -95,22 +98,20 @@ class Problem(eqx.Module):
         shorter = lambda: between(self.scheme, system, times[0], start, times[1])
         return lax.cond(inside, shorter, lambda: system.values(start[0]))
 
-    def output(
-        self, i: int, system: System, fns: list[Callable], j: Array, start: Point
-    ) -> PyTree:
+    def output(self, i: int, parameters: Parameters, j: Array, start: Point) -> PyTree:
         """What output `i` saves in row `j`, from the state at the start of its step."""
-        rows, y = self.rows[i], start[0]
+        (system, fns), rows, y = parameters, self.rows[i], start[0]
         if rows.may_be_inside:
             at = rows.stop[j], start, rows.time[j], rows.inside[j]
             y = self.between(system, *at)
         return fns[i](rows.time[j], y, system.args), all_finite(y)
 
     def outputs(
-        self, i: int, system: System, fns: list[Callable], starts: PyTree, n: Array
+        self, i: int, parameters: Parameters, starts: PyTree, n: Array
     ) -> PyTree:
         """What output `i` saves in all rows, from the states at the starts of their
         steps; of `n` steps."""
-        rows = self.rows[i]
+        (system, fns), rows = parameters, self.rows[i]
         # Of rows that are not reached nothing may fail.
         reached = rows.reached(n)
         time = jnp.where(reached, rows.time, self.steps.t0)
@@ -166,7 +167,7 @@ def run(problem: Problem, keep: Array | None = None):
 
     `keep` are the steps whose starting states are kept.
     """
-    system, fns, last = problem.system, problem.fns, problem.last
+    parameters, last = (problem.system, problem.fns), problem.last
     tracks = [
         None if len(rows) == 0 else _track(problem, i)
         for i, rows in enumerate(problem.rows)
@@ -184,7 +185,7 @@ def run(problem: Problem, keep: Array | None = None):
         if stacked[i] is not None:
             values, good = stacked[i]
             if problem.at_once:
-                values, good = problem.outputs(i, system, fns, stacked[i], progress.n)
+                values, good = problem.outputs(i, parameters, stacked[i], progress.n)
             finite &= jnp.all(good | ~rows.reached(progress.n))
         saved.append(values)
     success: Any = dfx.RESULTS.successful
@@ -204,7 +205,7 @@ def _track(problem: Problem, i: int) -> Track:
         return Track(rows.stop, number, lambda j, point: point, problem.start)
     y = problem.start[0]
     init = fns[i](problem.steps.t0, y, system.args), jnp.asarray(True)
-    value = lambda j, point: problem.output(i, system, fns, j, point)
+    value = lambda j, point: problem.output(i, (system, fns), j, point)
     return Track(rows.stop, number, value, init)
 
 
@@ -283,10 +284,10 @@ def _put(rows: PyTree, i: Array, value: PyTree, here: Any = True) -> PyTree:
     return jtu.tree_map(leaf, rows, value)
 
 
-def saved_rows(problem: Problem, i: int, ts, ys, values, progress: Progress):
+def saved_rows(problem: Problem, i: int, buffer, values, progress: Progress):
     """The final times and values of output `i`, from those that Diffrax allocated, and
     the numbers of rows and of times of `ts` that were saved."""
-    sub, rows, n = problem.subs[i], problem.rows[i], progress.n
+    (ts, ys), sub, rows, n = buffer, problem.subs[i], problem.rows[i], progress.n
     steps, system, fn = problem.steps, problem.system, problem.fns[i]
     first = int(sub.t0)
     if first:

@@ -277,7 +277,8 @@ def _walk(
     data or `None`, which is returned for all moves.
     """
     if not isinstance(moves, Stages):
-        return (*act(moves, span, data, state), None)[:3]
+        state, result, *output = act(moves, span, data, state)
+        return state, result, output[0] if output else None
     order = slice(None, None, -1 if reverse else 1)
     number = len(moves.moves)
     # `data` is a list with an entry for each move, or a pair of such lists.

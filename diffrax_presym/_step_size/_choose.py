@@ -139,9 +139,9 @@ def choose_step(
             "`solve = lambda dt0: diffeqsolve(system, solver, t0, t1, dt0, y0, ...)`."
         )
     t0, t1 = check_times(t0, t1, "choose_step")
-    tolerances = tuple(
-        check_tolerance(x, f"choose_step({name}=...)")
-        for name, x in (("rtol", rtol), ("atol", atol))
+    tolerances = (
+        check_tolerance(rtol, "choose_step(rtol=...)"),
+        check_tolerance(atol, "choose_step(atol=...)"),
     )
     if not any(tolerances):
         raise ValueError(

@@ -1,7 +1,7 @@
 import numpy as np
 
 
-def intervals(ts: np.ndarray, t0: np.ndarray, t1: np.ndarray) -> int | None:
+def intervals(ts: np.ndarray, t0: float, t1: float) -> int | None:
     """The number of equal intervals of the span at whose ends all times lie.
 
     `None` if there is none, or only one that is much finer than the times, as for 0.3

@@ -10,7 +10,8 @@ from jaxtyping import Array, Bool, Inexact, PyTree
 
 from .._friction._base import AbstractFriction, Mechanics, Parts
 from .._friction._damping import AbstractDamping
-from .._friction._linear import fit_friction, LinearFriction, one_rate
+from .._friction._fit import fit_friction, one_rate
+from .._friction._linear import LinearFriction
 from .._misc import (
     as_time,
     describe,

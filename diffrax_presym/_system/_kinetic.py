@@ -1,6 +1,6 @@
 import abc
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -11,8 +11,10 @@ from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
 from .._forms import as_form, divide, multiply
 from .._friction._exponential import gauss_legendre
-from .._friction._linear import LinearFriction, MASS
+from .._friction._linear import LinearFriction
+from .._friction._rates import MASS
 from .._misc import (
+    AbstractVar,
     as_positive,
     cast_to,
     largest,
@@ -29,10 +31,13 @@ from .._misc import (
 class AbstractKinetic(eqx.Module):
     """A kinetic energy `T(t, p, args)`, its velocity, and its exact flow."""
 
-    # Whether the velocity is linear in `p`, and its flow depends on time by the length
-    # of its span alone.
-    is_quadratic: eqx.AbstractVar[bool]
-    is_autonomous: eqx.AbstractVar[bool]
+    # Whether its flow depends on time by the length of its span alone.
+    is_autonomous: AbstractVar[bool]
+
+    @property
+    @abc.abstractmethod
+    def is_quadratic(self) -> bool:
+        """Whether the velocity is linear in `p`."""
 
     @abc.abstractmethod
     def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
@@ -92,8 +97,8 @@ class QuadraticKinetic(AbstractKinetic):
         """
         self.mass = as_form(mass, MASS, positive=True)
 
-    is_quadratic = True
-    is_autonomous = True
+    is_quadratic: ClassVar[bool] = True
+    is_autonomous: ClassVar[bool] = True
 
     def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
         energy = tree_dot(p, self.velocity(t, p, args))
@@ -160,8 +165,8 @@ class RelativisticKinetic(AbstractKinetic):
         p = tree_scale(1 / unit, p)
         return p, tree_dot(p, p), (rest / unit) ** 2, unit
 
-    is_quadratic = False
-    is_autonomous = True
+    is_quadratic: ClassVar[bool] = False
+    is_autonomous: ClassVar[bool] = True
 
     def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
         _, square, rest, unit = self._scaled(p)
@@ -188,8 +193,8 @@ class CallableKinetic(AbstractKinetic):
     """Any function `T(t, p, args)` as a kinetic energy, differentiated by JAX."""
 
     fn: Callable
-    is_quadratic = False
-    is_autonomous = True
+    is_quadratic: ClassVar[bool] = False
+    is_autonomous: ClassVar[bool] = True
 
     def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
         return self.fn(t, p, args)

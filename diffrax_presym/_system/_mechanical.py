@@ -14,7 +14,8 @@ from .._compositions import spans
 from .._friction._base import AbstractFriction, Linear, Mechanics, Parts
 from .._friction._damping import as_laws
 from .._friction._drag import Drag
-from .._friction._linear import fit_friction, has_one_rate, LinearFriction
+from .._friction._fit import fit_friction, has_one_rate
+from .._friction._linear import LinearFriction
 from .._friction._log_scale import Linear as LinearScale
 from .._misc import (
     all_finite,

@@ -1,7 +1,7 @@
 """The families of Hamiltonians of the paper, as systems."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -10,7 +10,8 @@ from jaxtyping import PyTree
 
 from .._friction._base import Mechanics, Parts
 from .._friction._damping import AbstractDamping, as_laws, ConstantDamping
-from .._friction._linear import fit_friction, LinearFriction, one_rate
+from .._friction._fit import fit_friction, one_rate
+from .._friction._linear import LinearFriction
 from .._misc import check_callable, Scalar, scalar_fn, Time, tree_scale
 from ._energy import Hamiltonian
 from ._kinetic import (
@@ -128,7 +129,7 @@ class _ScaledKinetic(AbstractKinetic):
     kinetic: AbstractKinetic
     eta1: AbstractDamping
     eta2: AbstractDamping
-    is_autonomous = False
+    is_autonomous: ClassVar[bool] = False
 
     @property
     def is_quadratic(self) -> bool:
@@ -160,7 +161,7 @@ class _ScaledKinetic(AbstractKinetic):
         displacement = self._by_eta1(jnp.zeros_like(h)).prepare(t, h, order)
         return self._parts(t)[0], displacement, friction.prepare(t, h, order)
 
-    def flow(self, friction, t, h, data, p, args):
+    def flow(self, friction: Any, t, h, data, p, args):
         if not self.is_quadratic:
             return integrate(self.velocity, friction, t, h, data, p, args)
         scale, displacement, decay = data

@@ -130,9 +130,9 @@ def work_precision(
     `ValueError` if an argument is not valid; `RuntimeError` if no solve converges.
     """
     t0, t1 = check_times(t0, t1, "work_precision")
-    tolerance = tuple(
-        check_tolerance(x, f"work_precision({name}=...)")
-        for name, x in (("rtol", rtol), ("atol", atol))
+    tolerance = (
+        check_tolerance(rtol, "work_precision(rtol=...)"),
+        check_tolerance(atol, "work_precision(atol=...)"),
     )
     if not solves or not any(tolerance):
         raise ValueError(
