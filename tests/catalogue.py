@@ -1195,7 +1195,7 @@ PRECISIONS = ["float64", "float32"]
 # What is exported and not combined here, and the file of tests that has it.
 ELSEWHERE = {
     *("ArclengthDensity", "DistanceDensity", "StepDensityController"),  # step_density
-    *("ChosenStep", "FixedStepAdjoint"),
+    *("ChosenStep", "FixedStepAdjoint", "StepsBetween"),  # choose_step, adjoint
     *("ConformalHamiltonian", "DissipativeHamiltonian"),  # functions, used above
     *("ExponentialScaling", "CustomScaling", "MirrorMap"),  # bregman
     *("Splitting", "SplittingTableau"),  # tableaus

@@ -152,7 +152,7 @@ def test_friction_by_an_operator_in_single_precision(size):
     sol = solve(system, dps.Strang(), t0, t1, t1, (0 * p0, p0), **END)
     _, p = last(sol)
     exact = np.exp(-np.diag(matrix).astype(float))
-    accurate = np.max(np.abs(p - exact)) < 2e-5
+    accurate = np.max(np.abs(np.asarray(p) - exact)) < 2e-5
     assert accurate or not np.all(np.isfinite(p))
 
 
@@ -179,7 +179,7 @@ def test_a_step_that_is_too_large_is_a_failure(saveat):
     sol = dfx.diffeqsolve(
         system,
         dps.TunedRKN6(),
-        *(0.0, 50.0, 5.0, Y0),
+        *(0.0, 50.0, 25.0, Y0),
         **{"saveat": saveat, "throw": False, "adjoint": dps.FixedStepAdjoint()},
     )
     assert not np.all(np.isfinite(last(sol)[0]))

@@ -125,17 +125,19 @@ class LogDamping(AbstractDamping):
     """
 
     gamma: Numbers
-    shift: Inexact[ArrayLike, "..."]
+    shift: Inexact[ArrayLike, "..."] | None
 
-    def __init__(self, gamma, shift: ArrayLike = 0.0):
+    def __init__(self, gamma, shift: ArrayLike | None = None):
         """**Arguments:**
 
         - `gamma`: the strength of the damping, dimensionless, of any sign. A number,
             array or pytree as for [`diffrax_presym.ConstantDamping`][].
-        - `shift`: the shift $s$ of time, in units of time: a number. Defaults to 0.
+        - `shift`: the shift $s$ of time, in units of time: a number. Defaults to none.
         """
         self.gamma = as_numbers(gamma, "`LogDamping(gamma)`")
-        self.shift = as_finite(shift, "`LogDamping(shift=...)`")
+        self.shift = shift
+        if shift is not None:
+            self.shift = as_finite(shift, "`LogDamping(shift=...)`")
 
     @property
     def terms(self):

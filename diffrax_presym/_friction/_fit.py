@@ -16,13 +16,13 @@ from ._damping import AbstractDamping
 from ._linear import LinearFriction
 from ._log_scale import (
     AbstractLogScale,
-    Linear,
 )
 from ._rates import (
     COEFFICIENTS,
     CoupledFriction,
     DAMPING,
     EntryFriction,
+    identity,
     MASS,
     MatrixRate,
     ProductRate,
@@ -69,9 +69,13 @@ def _merged(
     terms: list[tuple[AbstractLogScale, Array]], like: Array
 ) -> EntryFriction | CoupledFriction:
     coupled = any(is_matrix(rate, like) for _, rate in terms)
-    if len(terms) > 1 and all(law.is_autonomous for law, _ in terms):
-        rates = [_as_matrix(x, like) if coupled else x for _, x in terms]
-        terms = [(Linear(), functools.reduce(jnp.add, rates))]
+    # Laws of one log scale are one law.
+    same: dict[Any, list[tuple[AbstractLogScale, Array]]] = {}
+    for law, rate in terms:
+        leaves, structure = jtu.tree_flatten(law)
+        key = structure, tuple(map(id, leaves))
+        same.setdefault(key, []).append((law, rate))
+    terms = [(group[0][0], _sum(group, like, coupled)) for group in same.values()]
     for law, _ in terms:
         _check_values(law, like, coupled)
     if not coupled:
@@ -85,6 +89,17 @@ def _merged(
         )
     ((law, rate),) = terms
     return CoupledFriction(law, MatrixRate(rate))
+
+
+def _sum(
+    terms: list[tuple[AbstractLogScale, Array]], like: Array, coupled: bool
+) -> Array:
+    rates = [rate for _, rate in terms]
+    if len(rates) > 1 and coupled:
+        rates = [_as_matrix(x, like) for x in rates]
+    rank = max(map(jnp.ndim, rates))
+    rates = [jnp.reshape(x, (1,) * (rank - jnp.ndim(x)) + jnp.shape(x)) for x in rates]
+    return functools.reduce(jnp.add, rates)
 
 
 def _check_values(law: AbstractLogScale, like: Array, coupled: bool) -> None:
@@ -151,7 +166,7 @@ def _as_matrix(rate: Array, like: Array) -> Array:
     if is_matrix(rate, like):
         return rate
     entries = jnp.broadcast_to(rate, jnp.shape(like))
-    return entries[..., None] * jnp.eye(entries.shape[-1], dtype=entries.dtype)
+    return entries[..., None] * identity(entries)
 
 
 class SumDamping(AbstractDamping):

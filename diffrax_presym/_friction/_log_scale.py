@@ -122,18 +122,20 @@ _ALL_LOST = 40.0
 class Logarithm(AbstractLogScale):
     r"""$\eta(t) = \log(t + s)$."""
 
-    shift: Inexact[ArrayLike, "..."]
+    shift: Inexact[ArrayLike, "..."] | None
     is_autonomous: ClassVar[bool] = False
     is_smooth: ClassVar[bool] = True
 
     def __call__(self, t: Time) -> Scalar:
+        return jnp.log(self._after(t))
+
+    def _after(self, t: Time) -> Scalar:
         t = as_time(t)
-        return jnp.log(t + cast_to(self.shift, t))
+        return t if self.shift is None else t + cast_to(self.shift, t)
 
     def _since(self, t: Time) -> tuple[Bool[Array, "..."], Scalar]:
         """Whether `t` is the singularity, and the time since, or 1 there."""
-        t = as_time(t)
-        since = t + cast_to(self.shift, t)
+        since = self._after(t)
         return since == 0, jnp.where(since == 0, 1, since)
 
     def increment(self, t: Time, h: Time) -> Scalar:

@@ -97,15 +97,19 @@ class EntryFriction(eqx.Module):
         laws: list[Any] = [
             (by_quadrature(law, t, h, order), rate) for law, rate in self.terms
         ]
-        total = lambda get: functools.reduce(
-            jnp.add,
-            [_outer(get(x), cast_to(rate, x.x)) for x, rate in laws],
-        )
+        rank = max(max(jnp.ndim(x.x), jnp.ndim(rate)) for x, rate in laws)
+
+        def total(get, nodes: bool) -> Array:
+            terms = [
+                _outer(get(x), cast_to(rate, x.x), rank, nodes) for x, rate in laws
+            ]
+            return functools.reduce(jnp.add, terms)
+
         sums = [
-            _weighted(laws[0][0].carried.weights, jnp.exp(-total(nodes)))
-            for nodes in (lambda x: x.carried.x, lambda x: x.responded.x)
+            _weighted(laws[0][0].carried.weights, jnp.exp(-total(get, True)))
+            for get in (lambda x: x.carried.x, lambda x: x.responded.x)
         ]
-        return Effect(expm1(-total(lambda x: x.x)), *sums)
+        return Effect(expm1(-total(lambda x: x.x, False)), *sums)
 
     def fix(self, effect: Any) -> Effect:
         return effect
@@ -146,9 +150,12 @@ class EntryFriction(eqx.Module):
         return reduce_any([law.is_singular(t) for law, _ in self.terms])
 
 
-def _outer(x: Array, rate: Array) -> Array:
-    """Increments at a number of nodes, if any, times a rate for each entry."""
-    return x.reshape(*x.shape, *(1,) * (rate.ndim - max(x.ndim - 1, 0))) * rate
+def _outer(x: Array, rate: Array, rank: int, nodes: bool) -> Array:
+    """Increments times a rate, of numbers or entries of a rank; at several nodes, along
+    the first axis, or at none."""
+    lead, shape = x.shape[:nodes], x.shape[nodes:]
+    x = x.reshape(*lead, *(1,) * (rank - len(shape)), *shape)
+    return x * rate.reshape((1,) * (nodes + rank - rate.ndim) + rate.shape)
 
 
 def _weighted(weights: Array, x: Array) -> Array:
@@ -157,7 +164,10 @@ def _weighted(weights: Array, x: Array) -> Array:
 
 def _integral(spec: Integral | Quadrature, rate: Array) -> Array:
     if isinstance(spec, Quadrature):
-        return _weighted(spec.weights, jnp.exp(-_outer(spec.x, rate)))
+        return _weighted(
+            spec.weights,
+            jnp.exp(-_outer(spec.x, rate, max(spec.x.ndim - 1, rate.ndim), True)),
+        )
     total = -(rate + spec.shift) * spec.x
     return spec.factor * spec.x * expm1_ratio(total)
 
@@ -176,12 +186,14 @@ class MatrixRate(eqx.Module):
         return MatrixRate(self.matrix, self.shift + shift)
 
     def dense(self, like: Array) -> Array:
-        return self.matrix + self.shift * _identity(self.matrix)
+        return self.matrix + self.shift * identity(self.matrix[..., 0])
 
 
-def _identity(matrix: Array) -> Array:
-    one = jnp.eye(matrix.shape[-1], dtype=matrix.dtype)
-    return jnp.broadcast_to(one, matrix.shape)
+def identity(vectors: Array) -> Array:
+    """The identity matrix for each vector over the last axis."""
+    size = vectors.shape[-1]
+    one = jnp.eye(size, dtype=vectors.dtype)
+    return jnp.broadcast_to(one, (*vectors.shape, size))
 
 
 class ProductRate(eqx.Module):
@@ -261,7 +273,9 @@ class CoupledFriction(eqx.Module):
             return force - rate * self.rate(p)
         net = force - jnp.where(singular, 0, rate) * self.rate(p)
         matrix = self.log_scale.strength * cast_to(self.rate.dense(p), p)
-        limit = jnp.linalg.solve(_identity(matrix) + matrix, force[..., None])[..., 0]
+        limit = jnp.linalg.solve(identity(matrix[..., 0]) + matrix, force[..., None])[
+            ..., 0
+        ]
         at_rest = jnp.all(p == 0)
         return jnp.where(singular, jnp.where(at_rest, limit, jnp.nan), net)
 
