@@ -1,7 +1,9 @@
 """The command line of the benchmarks, and the tables that they print."""
 
 import argparse
+import math
 import re
+import statistics
 import sys
 
 
@@ -15,11 +17,18 @@ def command_line(doc):
     return parser
 
 
+def means(rows):
+    """The geometric mean and the least of each column, without those not reached."""
+    known = [[x for x in column if x and 0 < x < math.inf] for column in zip(*rows, strict=True)]
+    mean = [statistics.geometric_mean(x) if x else None for x in known]
+    return mean, [min(x, default=None) for x in known]
+
+
 class Table:
     """A table that is printed row by row, as aligned text or as Markdown.
 
     A column is its title and the format of its cells, as in `"error:>9.1e"`. Strings
-    are aligned only, and `None` is a dash.
+    are aligned only, and what is `None` or infinite is a dash.
     """
 
     def __init__(self, caption, *columns):
@@ -37,7 +46,7 @@ class Table:
     def row(self, *cells):
         texts = []
         for cell, spec in zip(cells, self.formats, strict=True):
-            cell = "-" if cell is None else cell
+            cell = "-" if cell is None or cell == math.inf else cell
             if isinstance(cell, str):
                 spec = re.match(r"[<>]\d+", spec).group()  # pyright: ignore
             texts.append(format(cell, spec))

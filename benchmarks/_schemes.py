@@ -67,26 +67,27 @@ TRACE_TOLERANCE = 1e-12
 
 
 @eqx.filter_jit
-def _excess(solver, h, friction):
-    """|trace| - (1 + det) of one step of q'' + friction q' + q = 0, for each `h`."""
-    hamiltonian = dps.ConformalHamiltonian(
-        dps.QuadraticKinetic(),
-        lambda t, q, args: q**2 / 2,
-        dps.ConstantDamping(friction),
-    )
-    term = dps.HamiltonianTerm(hamiltonian)
+def step_matrices(solver, h, friction):
+    """The matrix of a step of q'' + friction q' + q = 0, for each `h` and `friction`;
+    not a number if the step fails."""
 
-    def one(h):
+    def one(h, friction):
+        system = dps.MechanicalSystem(
+            dps.QuadraticKinetic(),
+            lambda t, q, args: q**2 / 2,
+            dps.ConstantDamping(friction),
+        )
+
         def step(y):
             t0 = jnp.zeros_like(h)
-            carry = solver.init(term, t0, h, y, None)
-            return solver.step(term, t0, h, y, None, carry, made_jump=False)[0]
+            carry = solver.init(system, t0, h, y, None)
+            y, *_, result = solver.step(system, t0, h, y, None, carry, made_jump=False)
+            return jnp.where(result == dfx.RESULTS.successful, jnp.stack(y), jnp.nan)
 
         unit = jnp.ones_like(h), jnp.zeros_like(h)
-        trace = step(unit)[0] + step(unit[::-1])[1]
-        return jnp.abs(trace) - (1 + jnp.exp(-friction * h))
+        return jnp.stack([step(unit), step(unit[::-1])], axis=1)
 
-    return jax.vmap(one)(h)
+    return jax.vmap(one)(h, jnp.broadcast_to(friction, h.shape))
 
 
 def stability_limit(scheme, friction=0.0):
@@ -97,7 +98,12 @@ def stability_limit(scheme, friction=0.0):
     modulus at most one, which is |trace| <= 1 + det. Infinite if all steps that were
     tried are stable, up to 2.2 per evaluation.
     """
-    excess = lambda h: np.asarray(_excess(scheme.solver, jnp.asarray(h), friction))
+
+    def excess(h):
+        matrices = np.asarray(step_matrices(scheme.solver, jnp.asarray(h), friction))
+        trace = matrices[:, 0, 0] + matrices[:, 1, 1]
+        return np.abs(trace) - (1 + np.exp(-friction * h))
+
     h = np.linspace(0, 2.2 * scheme.evaluations, 22001)
     values = excess(h)
     first = lambda values: np.argmax(values > TRACE_TOLERANCE)

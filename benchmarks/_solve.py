@@ -14,35 +14,19 @@ import diffrax_presym as dps
 
 LAST = dfx.SaveAt(t1=True)
 CONSTANT = dfx.ConstantStepSize()
+# A motion that escapes would never end.
+MOST = 10**5
 
 
 def solve(
-    system,
-    solver,
-    t0,
-    t1,
-    dt0,
-    y0,
-    args=None,
+    *problem,
     controller: dfx.AbstractStepSizeController = CONSTANT,
     saveat=LAST,
     **options,
 ) -> dfx.Solution:
-    """`diffeqsolve` of a Hamiltonian, or of terms; a failure is a result."""
-    if isinstance(system, dps.AbstractHamiltonian):
-        system = dps.HamiltonianTerm(system)
-    return dfx.diffeqsolve(
-        system,
-        solver,
-        t0,
-        t1,
-        dt0,
-        y0,
-        args,
-        stepsize_controller=controller,
-        saveat=saveat,
-        **({"max_steps": None, "throw": False} | options),
-    )
+    """`diffeqsolve`; a failure is a result."""
+    options = {"max_steps": None, "throw": False, "saveat": saveat} | options
+    return dfx.diffeqsolve(*problem, stepsize_controller=controller, **options)
 
 
 def last(sol) -> Any:
@@ -52,32 +36,29 @@ def last(sol) -> Any:
 
 def states(
     term, solver, times, y0, x, args=None, *, adaptive=False, density=None, **options
-):
+) -> Any:
     """What is saved in `x` equal steps, or in adaptive ones with tolerance `x`: by
     default the final state.
 
-    With a step density the steps vary, and the first is one of `x` equal ones. The
-    result is not a number where the solve failed.
+    Solvers of this package run in the loop of `FixedStepAdjoint`. With a step density
+    the steps vary, and the first is one of `x` equal ones. The result is not a number
+    where the solve failed.
     """
     t0, t1 = times
+    dt0 = None if adaptive else (t1 - t0) / x
     if adaptive:
         options["controller"] = dfx.PIDController(rtol=x, atol=x)
-        # A motion that escapes would never end.
-        options["max_steps"] = 10**5
-    dt0 = None if adaptive else (t1 - t0) / x
-    if density is not None:
+        options["max_steps"] = MOST
+    elif density is not None:
         epsilon, dt0 = dt0 / density(t0, y0, args), None
         options["controller"] = dps.StepDensityController(term, epsilon, density)
-        options["max_steps"] = 10**5
+        options["max_steps"] = MOST
+    elif isinstance(solver, dps.extend.AbstractPresymplecticSolver):
+        options.setdefault("adjoint", dps.FixedStepAdjoint())
     sol = solve(term, solver, t0, t1, dt0, y0, args, **options)
     good = sol.result == dfx.RESULTS.successful
     ys = sol.ys if "saveat" in options else last(sol)
     return jax.tree.map(lambda y: jnp.where(good, y, jnp.nan), ys)
-
-
-def final_state(system, solver, times, y0, x, args=None, *, adaptive=False):
-    """The state after `x` equal steps, or of adaptive ones with tolerance `x`."""
-    return states(system, solver, times, y0, x, args, adaptive=adaptive)
 
 
 def relative_error(y, exact):
@@ -88,9 +69,15 @@ def relative_error(y, exact):
     return np.max(np.abs(y - exact)) / np.max(np.abs(exact))
 
 
+def reference_end(system, y0, t0, t1, args=None, **options) -> Any:
+    """The solution at `t1`, by `reference`."""
+    ys = reference(system, y0, [t0, t1], args, **options)
+    return jax.tree.map(lambda y: y[0], ys)
+
+
 def reference(
-    hamiltonian, y0, times, args=None, *, tolerance=1e-12, batch=False, longest=0.25
-):
+    system, y0, times, args=None, *, tolerance=1e-12, batch=False, longest=0.25
+) -> Any:
     """The solution at all times after the first, independent of what is measured.
 
     A `batch` of initial states has a leading axis, and so has its solution.
@@ -102,20 +89,18 @@ def reference(
     and 1e-14 to 2e-13 on the Kepler problem, whose orbit amplifies it.
     """
     y0, times = jax.tree.map(jnp.asarray, y0), jnp.asarray(times)
-    solution = eqx.filter_jit(
-        eqx.filter_vmap(_extrapolated, in_axes=(None, 0, None, None, None))
-        if batch
-        else _extrapolated
-    )
+    axes = (None, 0, None, None, None)
+    solution = eqx.filter_vmap(_extrapolated, in_axes=axes) if batch else _extrapolated
+    solution = eqx.filter_jit(solution)
     # Steps end at the times, so that longer ones would not differ when halved.
     longest = min(longest, float(np.min(np.diff(times))))
     least, change = longest / 2500, np.inf
-    ys = solution(hamiltonian, y0, times, args, longest)
+    ys = solution(system, y0, times, args, longest)
     while not change < tolerance:
         longest /= 2
         if longest < least:
             raise RuntimeError(f"No reference solution: halving changes it by {change}")
-        before, ys = ys, solution(hamiltonian, y0, times, args, longest)
+        before, ys = ys, solution(system, y0, times, args, longest)
         change = relative_error(before, ys)
     return ys
 
@@ -123,10 +108,9 @@ def reference(
 LEVELS = 5
 
 
-def _extrapolated(hamiltonian, y0, times, args, longest):
-    term = dps.HamiltonianTerm(hamiltonian)
+def _extrapolated(system, y0, times, args, longest):
     y0, unravel = ravel_pytree(y0)
-    slope = lambda t, y: ravel_pytree(term.vf(t, unravel(y), args))[0]
+    slope = lambda t, y: ravel_pytree(system.vf(t, unravel(y), args))[0]
 
     def modified_midpoint(t, t_next, y, low, n):
         # In terms of the change from `y`, to round it and not `y` itself. Numbers of

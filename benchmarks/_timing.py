@@ -117,3 +117,13 @@ def time_to(curve, target):
                 slope = math.log(seconds / s) / math.log(e / max(error, 1e-16))
                 best = min(best, s * (e / target) ** slope)
     return best
+
+
+def fastest(curves, target, group):
+    """The least time to reach an error of a group of `(group, name)`, and its name."""
+    found = (
+        (time_to(curve, target), name)
+        for (kind, name), curve in curves.items()
+        if kind == group
+    )
+    return min(found, default=(math.inf, "-"))

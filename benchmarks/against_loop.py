@@ -1,6 +1,6 @@
 """`diffeqsolve` with our schemes against hand-written loops of the same schemes.
 
-Through the loop of `ReversibleAdjoint`. The other side is what a person would write for
+Through the loop of `FixedStepAdjoint`. The other side is what a person would write for
 speed: the force by hand, the damping of a step computed once, its moves fused, and
 outputs where they are known to be: at the end, at all steps, or at 100 times that are
 steps. On both sides the number of steps is known when they are compiled. A row gives
@@ -108,7 +108,7 @@ def ours(solver, potential, saved, steps):
             DT,
             (q, p),
             saveat=saveat,
-            adjoint=dps.ReversibleAdjoint(),
+            adjoint=dps.FixedStepAdjoint(),
             max_steps=steps if saved == "steps" else None,
             throw=True,
         )

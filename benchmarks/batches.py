@@ -93,9 +93,7 @@ def spread(n, *boxes):
 def pendulums():
     problem = problems.pendulum()
     polynomial = dps.ConformalHamiltonian(
-        dps.QuadraticKinetic(),
-        lambda t, q, args: -jnp.sum(jnp.cos(q)),
-        problem.hamiltonian.damping,
+        dps.QuadraticKinetic(), lambda t, q, args: -jnp.sum(jnp.cos(q)), problem.damping
     )
     return Batch(
         problem,
@@ -118,8 +116,8 @@ def henon_heiles():
 def batched(hamiltonian, t1, method, block=None):
     """`solve(y0, x)`, with `x` the number of steps, or the tolerance."""
     solver, options = method.scheme.solver, {}
-    if isinstance(solver, dps.AbstractPresymplecticSolver):
-        options["adjoint"] = dps.ReversibleAdjoint()
+    if isinstance(solver, dps.extend.AbstractPresymplecticSolver):
+        options["adjoint"] = dps.FixedStepAdjoint()
     one = lambda y0, x: states(
         hamiltonian, solver, (0.0, t1), y0, x, adaptive=method.adaptive, **options
     )

@@ -3,8 +3,9 @@
 Six systems whose friction is not one rate for all momenta, with the solvers of this
 package and those of Diffrax, adaptive and with constant steps. `best ours / theirs` are
 ratios of the least of any solver, by time and by evaluations; `schemes` are those that
-reach it. A dash is an error that none of the runs reached. The last table compares with
-MuJoCo, where it is installed.
+reach it. A dash is an error that none of the runs reached. A further table is the time
+of solves with matrix friction of 50 unknowns, that save at 401 times: few long steps
+over many short ones. The last table compares with MuJoCo, where it is installed.
 """
 
 import dataclasses
@@ -18,10 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from _mujoco import mujoco_tables
-from _report import command_line, Table
+from _report import command_line, means, Table
 from _schemes import DIFFRAX, SCHEMES
-from _solve import final_state, reference, relative_error, solve
-from _timing import error_curves, time_to
+from _solve import MOST, reference_end, relative_error, solve, states
+from _timing import error_curves, fastest, interleaved
 
 import diffrax_presym as dps
 
@@ -41,7 +42,7 @@ OURS = SCHEMES | {"SofroniouSpaletta8, Strang": STRANG_8}
 @dataclasses.dataclass(frozen=True)
 class System:
     name: str
-    system: dps.AbstractHamiltonian
+    system: dps.extend.AbstractSystem
     y0: Any
     t1: float
     schemes: tuple[str, ...]
@@ -158,16 +159,13 @@ ADAPTIVE = 10.0 ** -np.arange(2.5, 13.0, 1.5)
 
 def exact_solution(problem):
     if problem.name != "wave equation":
-        times = jnp.array([0.0, problem.t1])
-        found = reference(problem.system, problem.y0, times)
-        return jax.tree.map(lambda y: y[-1], found)
+        return reference_end(problem.system, problem.y0, 0.0, problem.t1)
     # A linear system has a solution by matrix exponential.
     import scipy.linalg
 
     n = len(problem.y0[0])
-    speed = float(n)
-    K = speed**2 * (2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
-    rates = np.asarray(problem.system.laws[0].gamma)
+    K = n**2 * (2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
+    rates = np.asarray(problem.system.friction[0].gamma)
     matrix = np.block([[np.zeros((n, n)), np.eye(n)], [-K, -np.diag(rates)]])
     y = scipy.linalg.expm(matrix * problem.t1) @ np.concatenate(problem.y0)
     return np.split(y, 2)
@@ -176,107 +174,116 @@ def exact_solution(problem):
 def work(problem, quick):
     """For every solver its points `(error, seconds)` and `(error, evaluations)`."""
     times = jnp.array([0.0, problem.t1])
-    run_one = eqx.filter_jit(final_state)
+    run_one = eqx.filter_jit(states)
     exact = exact_solution(problem)
     runs, evaluations = {}, {}
 
-    def add(name, solver, cost, sweep, adaptive=False):
+    def add(key, solver, cost, sweep, adaptive=False):
         sweep = [jnp.asarray(float(x)) for x in sweep]
         run = partial(run_one, problem.system, solver, times, problem.y0)
-        runs[name] = partial(run, adaptive=adaptive), sweep
-        evaluations[name] = [cost * float(x) for x in sweep]
+        runs[key] = partial(run, adaptive=adaptive), sweep
+        steps = partial(_adaptive_steps, problem, solver) if adaptive else float
+        evaluations[key] = [cost * int(steps(x)) for x in sweep]
 
     periods = problem.t1 / problem.fastest
     points, most = (5, 100) if quick else (9, 800)
     for name in problem.schemes:
         solver, _, cost = OURS[name]
         per_period = np.geomspace(2, most, points) * (1 + (cost == 1))
-        add(name, solver, cost, np.unique(np.ceil(periods * per_period / cost)))
-    tolerances = ADAPTIVE[:: 2 if quick else 1]
+        steps = np.unique(np.ceil(periods * per_period / cost))
+        add(("ours", name), solver, cost, steps)
     for name, (solver, _, cost) in DIFFRAX.items():
-        add(name, SCANNED[name], cost, tolerances, True)
+        tolerances = ADAPTIVE[:: 2 if quick else 1]
+        add(("Diffrax", name), SCANNED[name], cost, tolerances, True)
         per_period = np.geomspace(10, most, points)
         steps = np.unique(np.ceil(periods * per_period / cost))
-        add(name + ", constant", solver, cost, steps)
-        evaluations[name] = [
-            cost * _adaptive_steps(problem, solver, tol) for tol in tolerances
-        ]
-    curves, costs = {}, {}
+        add(("Diffrax", name + ", constant"), solver, cost, steps)
     error = lambda y: relative_error(y, exact)
-    timed = error_curves(runs, error, 2 if quick else 3)
-    for name, curve in timed.items():
-        curves[name] = curve
-        found = [float(error(runs[name][0](x))) for x in runs[name][1]]
-        pairs = zip(found, evaluations[name], strict=True)
-        costs[name] = [pair for pair in pairs if math.isfinite(pair[0])]
+    curves, costs = error_curves(runs, error, 2 if quick else 3), {}
+    for key in curves:
+        found = [float(error(runs[key][0](x))) for x in runs[key][1]]
+        pairs = zip(found, evaluations[key], strict=True)
+        costs[key] = [pair for pair in pairs if math.isfinite(pair[0])]
     return curves, costs
 
 
-def _adaptive_steps(problem, solver, tolerance):
-    controller = dfx.PIDController(rtol=tolerance, atol=tolerance)
-    sol = _count(problem.system, solver, problem.t1, problem.y0, controller)
-    return int(sol)
-
-
 @eqx.filter_jit
-def _count(system, solver, t1, y0, controller):
-    # A motion that escapes would never end.
-    sol = solve(system, solver, 0.0, t1, None, y0, None, controller, max_steps=10**5)
-    return sol.stats["num_steps"]
+def _adaptive_steps(problem, solver, tolerance):
+    control = dfx.PIDController(rtol=tolerance, atol=tolerance)
+    args = problem.system, solver, 0.0, problem.t1, None, problem.y0
+    return solve(*args, controller=control, max_steps=MOST).stats["num_steps"]
 
 
-def compare(curves, ours):
-    """For each target the least of ours, the least of Diffrax's, and their ratio."""
-    out = []
-    for target in TARGETS:
-        best = {}
-        for name, curve in curves.items():
-            side = name in ours
-            cost = time_to(curve, target)
-            if cost < best.get(side, (math.inf, ""))[0]:
-                best[side] = cost, name
-        both = best.get(True), best.get(False)
-        ratio = both[1][0] / both[0][0] if both[0] and both[1] else None
-        out.append((*both, ratio))
-    return out
-
-
-def main():
-    parser = command_line(__doc__)
-    parser.add_argument("--only", nargs="*", help="names of systems")
-    options = parser.parse_args()
-    means: dict[str, list] = {"time": [], "evaluations": []}
+def compare(problems, quick):
+    rows: dict[str, list] = {"time": [], "evaluations": []}
     table = Table(
         "Least of Diffrax over least of ours, at errors of 1e-3, 1e-6, 1e-9",
         *("system:<17", "by:<11"),
         *(f"{target:.0e}:>6.1f" for target in TARGETS),
         *("ours:<32", "Diffrax's:<30"),
     )
-    for make in SYSTEMS:
-        problem = make()
-        if options.only and problem.name.split()[0] not in options.only:
-            continue
-        found = work(problem, options.quick)
-        for kind, curves in zip(means, found, strict=True):
-            rows = compare(curves, problem.schemes)
-            means[kind].append([ratio for *_, ratio in rows])
-            ours, theirs = (_names([row[i] for row in rows]) for i in (0, 1))
-            ratios = (ratio for *_, ratio in rows)
-            table.row(problem.name, kind, *ratios, ours, theirs)
-    for kind, rows in means.items():
-        columns = list(zip(*rows, strict=True))
-        known = [[x for x in column if x is not None] for column in columns]
-        values = (float(np.exp(np.mean(np.log(x)))) if x else None for x in known)
-        table.row("geometric mean", kind, *values, "", "")
+    short = lambda found: " ".join(_SHORT.get(name, name) for _, name in found)
+    for problem in problems:
+        for kind, curves in zip(rows, work(problem, quick), strict=True):
+            ours, theirs = (
+                [fastest(curves, target, group) for target in TARGETS]
+                for group in ("ours", "Diffrax")
+            )
+            pairs = zip(ours, theirs, strict=True)
+            rows[kind].append(
+                [b / a if a < math.inf else None for (a, _), (b, _) in pairs]
+            )
+            table.row(problem.name, kind, *rows[kind][-1], short(ours), short(theirs))
+    for kind, ratios in rows.items():
+        table.row("geometric mean", kind, *means(ratios)[0], "", "")
+
+
+def many_times(quick):
+    """Matrix friction, saved at 401 times: in each step five of them, or at each end."""
+    n, t1 = 50, 40.0
+    rng = np.random.default_rng(0)
+    dampers = jnp.asarray(0.2 * np.eye(n) + 0.02 * rng.normal(size=(n, n)))
+    potential = lambda t, q, args: jnp.sum(jnp.diff(q) ** 2) - jnp.sum(jnp.cos(q))
+    law = dps.ViscousDamping(dampers)
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), potential, law)
+    y0, ts = (jnp.linspace(-1.0, 1.0, n), jnp.zeros(n)), jnp.linspace(0, t1, 401)
+    exact = jnp.asarray(reference_end(system, y0, 0.0, t1))
+    table = Table(
+        "Matrix friction of 50 unknowns, saved at 401 times: milliseconds",
+        *("solver:<15", "80 steps:>9.2f", "error:>8.0e", "400 steps:>9.2f"),
+        *("error:>8.0e", "80 / 400:>9.2f"),
+    )
+    for name in ("TunedRKN6", "BlanesMoanRKN4"):
+        options = {"saveat": dfx.SaveAt(ts=ts)}
+        solver = SCHEMES[name].solver
+        run = jax.jit(partial(states, system, solver, (0.0, t1), y0, **options))
+        calls = {steps: partial(run, jnp.asarray(float(steps))) for steps in (80, 400)}
+        found = interleaved(calls, 3 if quick else 15)
+        cells = []
+        for timing in found.values():
+            end = jax.tree.map(lambda y: y[-1], timing.result)
+            cells += [1e3 * timing.median, relative_error(end, exact)]
+        table.row(name, *cells, found[80].over(found[400]))
+
+
+def main():
+    parser = command_line(__doc__)
+    parser.add_argument("--only", nargs="*", help="names of systems")
+    parser.add_argument("--saved", action="store_true", help="only at 401 times")
+    options = parser.parse_args()
+    chosen = [make() for make in SYSTEMS]
+    if options.only:
+        chosen = [x for x in chosen if x.name.split()[0] in options.only]
+    elif options.quick:
+        chosen = chosen[::3]
+    if not options.saved:
+        compare(chosen, options.quick)
     if not options.only:
+        many_times(options.quick)
+    if not options.only and not options.saved:
         schemes = ("PresymplecticLeapfrog", "BlanesMoanRKN4", "TunedRKN6")
         solvers = {name: SCHEMES[name].solver for name in schemes}
         mujoco_tables(mujoco_problems(), solvers, options.quick)
-
-
-def _names(best):
-    names = [x[1] if x else "-" for x in best]
-    return " ".join(_SHORT.get(name, name) for name in names)
 
 
 _SHORT = {

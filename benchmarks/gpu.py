@@ -131,7 +131,7 @@ def gradients(n, counts, repeats):
             return jax.vmap(functools.partial(fn, adjoint=adjoint))
 
         value_and_grad = jax.value_and_grad(loss)
-        reversible = dps.ReversibleAdjoint()
+        reversible = dps.FixedStepAdjoint()
         fns = {
             "solve": batch(loss, reversible),
             "reversible": batch(value_and_grad, reversible),

@@ -3,7 +3,7 @@
 The leapfrog, on damped pendulums, whose sines take most of the time, and on springs
 with a cubic force, which takes almost none. A ratio is the time of value and gradient,
 with respect to the initial state and the damping, over that of the same solve alone.
-`ReversibleAdjoint` is compared with Diffrax's `RecursiveCheckpointAdjoint`, its
+`FixedStepAdjoint` is compared with Diffrax's `RecursiveCheckpointAdjoint`, its
 default, with `FixedStepAdjoint` in batches, and with reverse mode through a `lax.scan`
 written by hand, whose number of steps is fixed when it is compiled.
 Runs that would take too long or too much memory are
@@ -28,7 +28,7 @@ import diffrax_presym as dps
 jax.config.update("jax_enable_x64", True)
 
 T1 = 10.0
-REVERSIBLE = dps.ReversibleAdjoint()
+REVERSIBLE = dps.FixedStepAdjoint()
 CHECKPOINTED = dfx.RecursiveCheckpointAdjoint()
 ADJOINTS = {
     "reversible": REVERSIBLE,

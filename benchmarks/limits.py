@@ -52,7 +52,7 @@ def force_loop(problem, stages):
 
 def measured(problem, repeats):
     """The fastest scheme: its name and times; and the time of heyoka."""
-    exact, term = problem.reference(), dps.HamiltonianTerm(problem.hamiltonian)
+    exact, term = problem.reference(), problem.hamiltonian
     calls = {}
     for name in CANDIDATES:
         scheme = SCHEMES[name]

@@ -15,14 +15,14 @@ import diffrax_presym as dps
 @dataclasses.dataclass(frozen=True)
 class Problem:
     name: str
-    hamiltonian: dps.AbstractHamiltonian
-    # The right-hand side `rhs(t, q, p)` in NumPy, and the integral of the damping rate
-    # from `t` to `t + h`, for solvers outside of JAX.
-    rhs: Callable | None
-    increment: Callable | None
+    system: dps.extend.AbstractSystem
     q0: Any
     p0: Any
     t1: float
+    # The right-hand side `rhs(t, q, p)` in NumPy, and the integral of the damping rate
+    # from `t` to `t + h`, for solvers outside of JAX.
+    rhs: Callable | None = None
+    increment: Callable | None = None
     # Whether the force is linear in the positions.
     linear: bool = False
     # The solution at `t1`, where it has a closed form.
@@ -35,7 +35,7 @@ class Problem:
 
     @property
     def y0(self):
-        return jnp.asarray(self.q0), jnp.asarray(self.p0)
+        return jnp.asarray(self.q0, float), jnp.asarray(self.p0, float)
 
     def reference(self):
         """The solution at `t1`."""
@@ -46,24 +46,28 @@ class Problem:
 
     def solution(self, ts):
         """The solution at all times after the first."""
-        return reference(self.hamiltonian, self.y0, ts, longest=self.unit / 4)
+        return reference(self.system, self.y0, ts, longest=self.unit / 4)
 
 
-def conformal(potential, damping, kinetic=None):
+def mechanics(potential, friction=None, kinetic=None):
     kinetic = dps.QuadraticKinetic() if kinetic is None else kinetic
-    return dps.ConformalHamiltonian(kinetic, potential, damping)
+    return dps.MechanicalSystem(kinetic, potential, friction)
+
+
+def pair_distances(n):
+    """The distances of `n` bodies, whose coordinates are the rows of `q`."""
+    i, j = np.triu_indices(n, 1)
+    return lambda q: jnp.sqrt(jnp.sum((q[:, i] - q[:, j]) ** 2, axis=0))
 
 
 def pendulum():
     gamma = 0.1
     return Problem(
         "damped pendulum",
-        conformal(lambda t, q, args: -jnp.sum(jnp.cos(q)), dps.ConstantDamping(gamma)),
+        mechanics(lambda t, q, args: -jnp.sum(jnp.cos(q)), dps.ConstantDamping(gamma)),
+        *(np.array([2.0]), np.array([0.0]), 100.0),
         lambda t, q, p: (p, -np.sin(q) - gamma * p),
         lambda t, h: gamma * h,
-        np.array([2.0]),
-        np.array([0.0]),
-        100.0,
     )
 
 
@@ -71,12 +75,10 @@ def decaying():
     gamma = 3.0
     return Problem(
         "decaying oscillator",
-        conformal(dps.QuadraticPotential(), dps.LogDamping(gamma, 1.0)),
+        mechanics(dps.QuadraticPotential(), dps.LogDamping(gamma, 1.0)),
+        *(np.array([1.0]), np.array([0.0]), 100.0),
         lambda t, q, p: (p, -q - gamma / (t + 1) * p),
         lambda t, h: gamma * math.log1p(h / (t + 1)),
-        np.array([1.0]),
-        np.array([0.0]),
-        100.0,
         linear=True,
     )
 
@@ -95,12 +97,10 @@ def henon_heiles():
 
     return Problem(
         "damped Henon-Heiles",
-        conformal(potential, dps.ConstantDamping(gamma)),
+        mechanics(potential, dps.ConstantDamping(gamma)),
+        *(np.array([0.1, -0.3]), np.array([0.3, 0.1]), 100.0),
         rhs,
         lambda t, h: gamma * h,
-        np.array([0.1, -0.3]),
-        np.array([0.3, 0.1]),
-        100.0,
     )
 
 
@@ -111,17 +111,16 @@ def kepler():
         r2 = np.sum(q**2)
         return p, -q / (r2 * np.sqrt(r2)) - gamma * p
 
+    distance = lambda q: jnp.sqrt(jnp.sum(q**2))
     return Problem(
         "Kepler with drag",
-        conformal(
-            lambda t, q, args: -1 / jnp.sqrt(jnp.sum(q**2)), dps.ConstantDamping(gamma)
-        ),
-        rhs,
-        lambda t, h: gamma * h,
+        mechanics(lambda t, q, args: -1 / distance(q), dps.ConstantDamping(gamma)),
         np.array([1 - e, 0.0]),
         np.array([0.0, math.sqrt((1 + e) / (1 - e))]),
         20 * math.pi,
-        distances=lambda q: jnp.sqrt(jnp.sum(q**2)),
+        rhs,
+        lambda t, h: gamma * h,
+        distances=distance,
     )
 
 
@@ -142,37 +141,28 @@ def chain(n=100):
 
     return Problem(
         f"chain of {n}",
-        conformal(potential, dps.ConstantDamping(gamma)),
+        mechanics(potential, dps.ConstantDamping(gamma)),
+        *(np.sin(2 * np.pi * np.arange(n) / n), np.zeros(n), 50.0),
         rhs,
         lambda t, h: gamma * h,
-        np.sin(2 * np.pi * np.arange(n) / n),
-        np.zeros(n),
-        50.0,
     )
 
 
 def relativistic():
-    gamma = 0.05
+    gamma, potential = 0.05, dps.QuadraticPotential()
     return Problem(
         "relativistic oscillator",
-        conformal(
-            dps.QuadraticPotential(),
-            dps.ConstantDamping(gamma),
-            dps.RelativisticKinetic(),
-        ),
+        mechanics(potential, dps.ConstantDamping(gamma), dps.RelativisticKinetic()),
+        *(np.array([2.0]), np.array([0.0]), 100.0),
         lambda t, q, p: (p / np.sqrt(np.sum(p**2) + 1), -q - gamma * p),
         lambda t, h: gamma * h,
-        np.array([2.0]),
-        np.array([0.0]),
-        100.0,
     )
 
 
 def random_quadratic(n=1000, m=1250):
-    gamma = 0.7
+    gamma, t1 = 0.7, 20.0
     a = np.random.default_rng(0).standard_normal((m, n)) / math.sqrt(m)
     hessian = a.T @ a
-    t1 = 20.0
 
     def exact():
         eigenvalues, modes = np.linalg.eigh(hessian)
@@ -183,30 +173,19 @@ def random_quadratic(n=1000, m=1250):
         p = -decay * (eigenvalues / omega * np.sin(phase)).real
         return np.array([modes @ (q * amplitude), modes @ (p * amplitude)])
 
-    def rhs(t, q, p):
-        return p, -hessian @ q - gamma * p
-
+    potential = dps.QuadraticPotential(jnp.asarray(hessian))
     return Problem(
         f"random quadratic, {n}",
-        conformal(
-            dps.QuadraticPotential(jnp.asarray(hessian)), dps.ConstantDamping(gamma)
-        ),
-        rhs,
+        mechanics(potential, dps.ConstantDamping(gamma)),
+        *(np.ones(n), np.zeros(n), t1),
+        lambda t, q, p: (p, -hessian @ q - gamma * p),
         lambda t, h: gamma * h,
-        np.ones(n),
-        np.zeros(n),
-        t1,
         linear=True,
         exact=exact,
     )
 
 
 PROBLEMS = [
-    pendulum,
-    decaying,
-    henon_heiles,
-    kepler,
-    chain,
-    relativistic,
+    *(pendulum, decaying, henon_heiles, kepler, chain, relativistic),
     random_quadratic,
 ]

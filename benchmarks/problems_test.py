@@ -7,8 +7,7 @@ parameters and initial states of the sources where these give them.
 import jax
 import jax.numpy as jnp
 import numpy as np
-from problems import conformal
-from problems_tuning import unforced
+from problems import mechanics, pair_distances, Problem
 
 import diffrax_presym as dps
 
@@ -21,25 +20,19 @@ def pleiades():
     v = [0.0, 0, 0, -1.25, 1, 0, 0]
     mass = np.arange(1.0, 8)
     i, j = np.triu_indices(7, 1)
-    weights = mass[i] * mass[j]
-
-    def potential(t, q, args):
-        return -jnp.sum(weights / distances(q))
-
-    def distances(q):
-        return jnp.sqrt(jnp.sum((q[:, i] - q[:, j]) ** 2, axis=0))
-
-    hamiltonian = conformal(potential, None, dps.QuadraticKinetic(mass[None]))
+    weights, distances = mass[i] * mass[j], pair_distances(7)
+    potential = lambda t, q, args: -jnp.sum(weights / distances(q))
+    system = mechanics(potential, kinetic=dps.QuadraticKinetic(mass[None]))
     momenta = mass * np.array([u, v])
-    return unforced("Pleiades", hamiltonian, [x, y], momenta, 3.0, distances=distances)
+    return Problem("Pleiades", system, [x, y], momenta, 3.0, distances=distances)
 
 
 def detest_orbit():
     """Orbit D3 of Hull, Enright, Fellen and Sedgwick (1972)."""
     e = 0.5
-    return unforced(
+    return Problem(
         "orbit D3",
-        conformal(lambda t, q, args: -1 / jnp.sqrt(jnp.sum(q**2)), None),
+        mechanics(lambda t, q, args: -1 / jnp.sqrt(jnp.sum(q**2))),
         [1 - e, 0.0],
         [0.0, np.sqrt((1 + e) / (1 - e))],
         20.0,
@@ -51,17 +44,11 @@ def figure_eight():
     """Three equal masses on an eight: Chenciner and Montgomery (2000), five periods."""
     q0 = np.array([[0.97000436, -0.97000436, 0], [-0.24308753, 0.24308753, 0]])
     v0 = np.array([-0.93240737, -0.86473146])
-    i, j = np.triu_indices(3, 1)
-
-    def potential(t, q, args):
-        return -jnp.sum(1 / distances(q))
-
-    def distances(q):
-        return jnp.sqrt(jnp.sum((q[:, i] - q[:, j]) ** 2, axis=0))
-
     p0 = np.stack([-v0 / 2, -v0 / 2, v0], axis=1)
-    t1, options = 5 * 6.32591398, {"distances": distances}
-    return unforced("figure eight", conformal(potential, None), q0, p0, t1, **options)
+    distances = pair_distances(3)
+    system = mechanics(lambda t, q, args: -jnp.sum(1 / distances(q)))
+    t1 = 5 * 6.32591398
+    return Problem("figure eight", system, q0, p0, t1, distances=distances)
 
 
 def logarithmic_galaxy():
@@ -71,8 +58,8 @@ def logarithmic_galaxy():
         x, y = q
         return jnp.log(0.14**2 + x**2 + (y / 0.9) ** 2) / 2
 
-    hamiltonian = conformal(potential, None)
-    return unforced("galactic orbit", hamiltonian, [0.49, 0.0], [0.6, 0.95], 50.0)
+    system = mechanics(potential)
+    return Problem("galactic orbit", system, [0.49, 0.0], [0.6, 0.95], 50.0)
 
 
 def disc_with_drag():
@@ -83,9 +70,9 @@ def disc_with_drag():
         height = 3.0 + jnp.sqrt(z**2 + 0.28**2)
         return -10 / jnp.sqrt(x**2 + y**2 + height**2)
 
-    return unforced(
+    return Problem(
         "disc, drag",
-        conformal(potential, dps.ConstantDamping(0.01)),
+        mechanics(potential, dps.ConstantDamping(0.01)),
         [8.0, 0.0, 0.5],
         [0.1, 0.9, 0.2],
         150.0,
@@ -100,10 +87,7 @@ def argon():
         [0.00, 0.02, 0.34, 0.36, -0.02, -0.35, -0.31],
         [0.00, 0.39, 0.17, -0.21, -0.40, -0.16, 0.21],
     ]
-    v0 = [
-        [-30.0, 50, -70, 90, 80, -40, -80],
-        [-20.0, -90, -60, 40, 90, 100, -60],
-    ]
+    v0 = [[-30.0, 50, -70, 90, 80, -40, -80], [-20.0, -90, -60, 40, 90, 100, -60]]
     # Per unit mass; one metre per second is one nanometre per nanosecond.
     strength = 4 * boltzmann * depth / mass
     i, j = np.triu_indices(7, 1)
@@ -113,8 +97,8 @@ def argon():
         inverse = sigma**6 / jnp.sum(d**2, axis=0) ** 3
         return strength * jnp.sum(inverse**2 - inverse)
 
-    hamiltonian = conformal(potential, None)
-    return unforced("argon crystal", hamiltonian, q0, v0, 0.02, unit=3e-4)
+    system = mechanics(potential)
+    return Problem("argon crystal", system, q0, v0, 0.02, unit=3e-4)
 
 
 def fermi_pasta_ulam_alpha(n=32):
@@ -126,8 +110,8 @@ def fermi_pasta_ulam_alpha(n=32):
         return jnp.sum(stretch**2 / 2 + stretch**3 / 12)
 
     q0 = np.sin(np.pi * np.arange(1, n + 1) / (n + 1))
-    hamiltonian = conformal(potential, dps.LogDamping(0.5, 1.0))
-    return unforced("FPU lattice, decaying", hamiltonian, q0, 0 * q0, 200.0)
+    system = mechanics(potential, dps.LogDamping(0.5, 1.0))
+    return Problem("FPU lattice, decaying", system, q0, 0 * q0, 200.0)
 
 
 def klein_gordon(n=16):
@@ -140,8 +124,8 @@ def klein_gordon(n=16):
 
     x, y = np.meshgrid(*[width * np.arange(n) - 5] * 2, indexing="ij")
     q0 = 2 * np.exp(-(x**2 + y**2) / 2)
-    hamiltonian = conformal(potential, dps.ConstantDamping(0.05))
-    return unforced("wave in the plane", hamiltonian, q0, 0 * q0, 20.0)
+    system = mechanics(potential, dps.ConstantDamping(0.05))
+    return Problem("wave in the plane", system, q0, 0 * q0, 20.0)
 
 
 def two_wells():
@@ -150,8 +134,8 @@ def two_wells():
     def potential(t, q, args):
         return jnp.sum(-(q**2) / 4 + q**4 / 8 - 0.2 * jnp.cos(t) * q)
 
-    hamiltonian = conformal(potential, dps.ConstantDamping(0.25))
-    return unforced("two wells, driven", hamiltonian, [1.0], [0.5], 60.0)
+    system = mechanics(potential, dps.ConstantDamping(0.25))
+    return Problem("two wells, driven", system, [1.0], [0.5], 60.0)
 
 
 def contraction():
@@ -165,8 +149,8 @@ def contraction():
     def log_scale(t):
         return 2 * jnp.log1p(-t / 60)
 
-    hamiltonian = conformal(potential, log_scale)
-    return unforced("contracting universe", hamiltonian, [0.3, 0.2], [0.0, 0.1], 45.0)
+    system = mechanics(potential, log_scale)
+    return Problem("contracting universe", system, [0.3, 0.2], [0.0, 0.1], 45.0)
 
 
 def relativistic_quartic():
@@ -177,10 +161,10 @@ def relativistic_quartic():
         x, y = q
         return (x**2 + y**2) / 2 + (x**4 + x**2 * y**2 + 2 * y**4) / 4
 
-    hamiltonian = conformal(
+    system = mechanics(
         potential, dps.ConstantDamping(0.02), dps.RelativisticKinetic(1.0, 2.0)
     )
-    return unforced("relativistic, quartic", hamiltonian, [1.5, 0.5], [0.0, 1.0], 60.0)
+    return Problem("relativistic, quartic", system, [1.5, 0.5], [0.0, 1.0], 60.0)
 
 
 def accelerated_logistic(n=20, m=60):
@@ -194,8 +178,8 @@ def accelerated_logistic(n=20, m=60):
     def potential(t, q, args):
         return jnp.sum(jax.nn.softplus(-rows @ q)) + jnp.sum(q**2) / 20
 
-    hamiltonian = conformal(potential, dps.LogDamping(3.0, 1.0))
-    return unforced("accelerated gradient", hamiltonian, np.zeros(n), np.zeros(n), 20.0)
+    system = mechanics(potential, dps.LogDamping(3.0, 1.0))
+    return Problem("accelerated gradient", system, np.zeros(n), np.zeros(n), 20.0)
 
 
 def morse_chain(n=20):
@@ -209,8 +193,8 @@ def morse_chain(n=20):
     q0 = 0.3 * np.sin(2 * np.pi * np.arange(n) / n)
     p0 = np.sqrt(mass) * 0.3 * np.cos(6 * np.pi * np.arange(n) / n)
     law = lambda t: 0.5 * jnp.sqrt(1 + t)
-    hamiltonian = conformal(potential, law, dps.QuadraticKinetic(mass))
-    return unforced("Morse chain", hamiltonian, q0, p0 - p0.mean(), 40.0)
+    system = mechanics(potential, law, dps.QuadraticKinetic(mass))
+    return Problem("Morse chain", system, q0, p0 - p0.mean(), 40.0)
 
 
 def vortices():
@@ -222,7 +206,7 @@ def vortices():
         square = (q[i] - q[j]) ** 2 + (p[i] - p[j]) ** 2
         return -jnp.sum(strength[i] * strength[j] * jnp.log(square)) / (4 * np.pi)
 
-    return unforced(
+    return Problem(
         "point vortices",
         dps.Hamiltonian(energy),
         [1.0, -1.0, 0.1, -0.2],

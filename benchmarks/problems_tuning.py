@@ -8,15 +8,9 @@ sources.
 
 import jax.numpy as jnp
 import numpy as np
-from problems import conformal, Problem, PROBLEMS as SEVEN
+from problems import mechanics, pair_distances, Problem, PROBLEMS as SEVEN
 
 import diffrax_presym as dps
-
-
-def unforced(name, hamiltonian, q0, p0, t1, **options):
-    """A problem for solvers in JAX only."""
-    q0, p0 = np.asarray(q0, float), np.asarray(p0, float)
-    return Problem(name, hamiltonian, None, None, q0, p0, t1, **options)
 
 
 def toda(n=16):
@@ -29,9 +23,7 @@ def toda(n=16):
 
     q0 = np.sin(2 * np.pi * np.arange(n) / n)
     damping = dps.LogDamping(3.0, 1.0)
-    return unforced(
-        "Toda lattice, 3 / t", conformal(potential, damping), q0, 0 * q0, 60
-    )
+    return Problem("Toda lattice, 3 / t", mechanics(potential, damping), q0, 0 * q0, 60)
 
 
 # Sun with the inner planets, Jupiter, Saturn, Uranus, Neptune and Pluto, from Hairer,
@@ -76,18 +68,13 @@ def planets():
     gravity, mass, q0, v0 = PLANETS
     i, j = np.triu_indices(len(mass), 1)
     weights = gravity * mass[i] * mass[j]
-
-    def potential(t, q, args):
-        return -jnp.sum(weights / distances(q))
-
-    def distances(q):
-        return jnp.sqrt(jnp.sum((q[:, i] - q[:, j]) ** 2, axis=0))
-
+    distances = pair_distances(len(mass))
+    potential = lambda t, q, args: -jnp.sum(weights / distances(q))
     kinetic = dps.QuadraticKinetic(mass[None])
-    hamiltonian = conformal(potential, dps.ConstantDamping(1e-6), kinetic)
-    return unforced(
+    system = mechanics(potential, dps.ConstantDamping(1e-6), kinetic)
+    return Problem(
         "outer planets, drag",
-        hamiltonian,
+        system,
         q0.T,
         (mass[:, None] * v0).T,
         73000.0,
@@ -110,9 +97,9 @@ def molecules(n=16):
         inverse = 1 / jnp.sum(d**2, axis=0) ** 3
         return 4 * jnp.sum(inverse**2 - inverse)
 
-    return unforced(
+    return Problem(
         "molecules, friction",
-        conformal(potential, dps.ConstantDamping(0.1)),
+        mechanics(potential, dps.ConstantDamping(0.1)),
         q0,
         p0 - p0.mean(axis=1, keepdims=True),
         5.0,
@@ -126,9 +113,9 @@ def elastic_pendulum():
         length = jnp.sqrt(jnp.sum(q**2))
         return 50 * (length - 1) ** 2 / 2 + q[1]
 
-    return unforced(
+    return Problem(
         "elastic pendulum",
-        conformal(potential, dps.ConstantDamping(0.02)),
+        mechanics(potential, dps.ConstantDamping(0.02)),
         [1.0, 0.0],
         [0.0, 0.0],
         50.0,
@@ -141,8 +128,8 @@ def duffing():
     def potential(t, q, args):
         return jnp.sum(q**2 / 2 + q**4 / 4 - 0.3 * jnp.cos(1.2 * t) * q)
 
-    hamiltonian = conformal(potential, dps.ConstantDamping(0.1))
-    return unforced("driven Duffing", hamiltonian, [1.0], [0.0], 80.0)
+    system = mechanics(potential, dps.ConstantDamping(0.1))
+    return Problem("driven Duffing", system, [1.0], [0.0], 80.0)
 
 
 def sine_gordon(n=64):
@@ -158,25 +145,9 @@ def sine_gordon(n=64):
 
     rho = np.sqrt(1 - omega**2)
     q0 = 4 * np.arctan(rho / omega / np.cosh(rho * x))
-    damping = dps.MixedDamping(0.2, 0.1, 0.5)
-    hamiltonian = conformal(potential, ShiftedDamping(damping, 1.0))
-    return unforced("sine-Gordon, mixed law", hamiltonian, q0, 0 * q0, 30.0)
-
-
-class ShiftedDamping(dps.AbstractDamping):
-    """A law that starts at a later time."""
-
-    law: dps.AbstractDamping
-    by: float
-
-    def __call__(self, t):
-        return self.law(t + self.by)
-
-    def increment(self, t, h):
-        return self.law.increment(t + self.by, h)
-
-    def rate(self, t):
-        return self.law.rate(t + self.by)
+    law = lambda t: 0.2 * jnp.log1p(t) + 0.1 * jnp.sqrt(1 + t)
+    system = mechanics(potential, law)
+    return Problem("sine-Gordon, mixed law", system, q0, 0 * q0, 30.0)
 
 
 def fermi_pasta_ulam(m=3, omega=20.0):
@@ -191,7 +162,7 @@ def fermi_pasta_ulam(m=3, omega=20.0):
 
     q0, p0 = np.zeros(2 * m), np.zeros(2 * m)
     q0[0], p0[0], q0[m], p0[m] = 1.0, 1.0, 1 / omega, 1.0
-    return unforced("stiff and soft springs", conformal(potential, None), q0, p0, 20.0)
+    return Problem("stiff and soft springs", mechanics(potential), q0, p0, 20.0)
 
 
 PROBLEMS = [

@@ -49,7 +49,7 @@ def pendulum(n):
 
 def ours(system, q0, solver, steps):
     sol = dfx.diffeqsolve(
-        dps.HamiltonianTerm(system),
+        system,
         solver,
         *(0.0, SPAN, SPAN / steps, (q0, jnp.zeros_like(q0))),
         saveat=dfx.SaveAt(ts=TS, fn=lambda t, y, args: y[0]),
@@ -98,7 +98,8 @@ def main():
         system = dps.LagrangianSystem(
             mass_matrix=lambda t, q, args, robot=robot: robot.inertia_matrix(q),
             potential=lambda t, q, args, robot=robot: robot.potential_energy(q),
-            friction=robot.damping_matrix(q0),  # constant for this robot
+            # The coefficients are constant for this robot.
+    friction=dps.ViscousDamping(robot.damping_matrix(q0)),
         )
         runs = {}
         for name, solver in schemes.items():

@@ -17,30 +17,23 @@ import numpy as np
 import problems
 from _report import command_line, Table
 from _schemes import SCHEMES, stability_limit
-from _solve import final_state
+from _solve import states
 
 
 jax.config.update("jax_enable_x64", True)
 
 # The first of each order is what the others are compared to.
-NAMES = [
+NAMES = (
     "PresymplecticLeapfrog",
     "PresymplecticLeapfrog, position first",
     "PresymplecticTao",
     "PresymplecticYoshida4",
     "PresymplecticYoshida4, position first",
-    "Suzuki4",
-    "BlanesMoan4",
-    "BlanesMoanRKN4",
-    "SuzukiYoshida(6)",
-    "SofroniouSpaletta6",
-    "BlanesMoan6",
-    "BlanesMoanRKN6",
-    "TunedRKN6",
-    "SuzukiYoshida(8)",
-    "SofroniouSpaletta8",
-    "BlanesCasasRKN8",
-]
+    *("Suzuki4", "BlanesMoan4", "BlanesMoanRKN4"),
+    *("SuzukiYoshida(6)", "SofroniouSpaletta6"),
+    *("BlanesMoan6", "BlanesMoanRKN6", "TunedRKN6"),
+    *("SuzukiYoshida(8)", "SofroniouSpaletta8", "BlanesCasasRKN8"),
+)
 PROBLEMS = {
     "pendulum": problems.pendulum,
     "decaying": problems.decaying,
@@ -48,7 +41,7 @@ PROBLEMS = {
     "Kepler": problems.kepler,
 }
 
-solve = eqx.filter_jit(final_state)
+solve = eqx.filter_jit(states)
 
 
 def error_constant(problem, exact, scheme):

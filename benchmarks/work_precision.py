@@ -88,7 +88,10 @@ def solver_of(problem, terms, solver, adaptive=False, ts=None, density=None):
 
     It returns the final state, or those at all of `ts`.
     """
-    times, ours = (0.0, problem.t1), isinstance(solver, dps.AbstractPresymplecticSolver)
+    times, ours = (
+        (0.0, problem.t1),
+        isinstance(solver, dps.extend.AbstractPresymplecticSolver),
+    )
     options: dict[str, Any] = {}
     if ts is not None:
         options["saveat"] = dfx.SaveAt(ts=jnp.asarray(ts))
@@ -96,7 +99,7 @@ def solver_of(problem, terms, solver, adaptive=False, ts=None, density=None):
         options["density"] = density
     elif ours:
         reversible = solver.reverse is not None
-        fast = dps.ReversibleAdjoint if reversible else dps.FixedStepAdjoint
+        fast = dps.FixedStepAdjoint if reversible else dps.FixedStepAdjoint
         options["adjoint"] = fast()
     args = terms, solver, times, problem.y0
     return jax.jit(lambda x: states(*args, x, adaptive=adaptive, **options))
@@ -150,10 +153,10 @@ def accepts(solver, problem, term):
 
 def all_runs(problem, quick, ts=None):
     """Every method: `{(group, name): (solve, sweep)}`."""
-    term = dps.HamiltonianTerm(problem.hamiltonian)
+    term = problem.hamiltonian
     run_of = lambda *args, **options: solver_of(problem, *args, ts=ts, **options)
     runs = {}
-    separable = problem.hamiltonian.splits != ()
+    separable = problem.splits != ()
     ours = {name: SCHEMES[name] for name in OURS} if separable else OTHERS
     for name, (solver, _, evaluations) in ours.items():
         if (problem.linear or "Linear" not in name) and accepts(solver, problem, term):

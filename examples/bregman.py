@@ -71,7 +71,7 @@ def solve(objective, scaling, solver, q0, ts, substeps):
     """The gap f - f* at the given times, with `substeps` steps between them."""
     hamiltonian = dps.BregmanHamiltonian(dps.EuclideanMirror(), objective, scaling)
     sol = dfx.diffeqsolve(
-        dps.HamiltonianTerm(hamiltonian),
+        hamiltonian,
         dps.Substeps(solver, substeps),
         t0=ts[0],
         t1=ts[-1],
@@ -126,7 +126,7 @@ def convergence(quick):
 
     def end(solver, n):
         sol = dfx.diffeqsolve(
-            dps.HamiltonianTerm(H),
+            H,
             solver,
             t0=1.0,
             t1=3.0,

@@ -52,7 +52,7 @@ def throw(speed, angle, friction, adjoint, dense=False):
         dps.QuadraticKinetic(), potential, dps.ConstantDamping(friction)
     )
     return dfx.diffeqsolve(
-        dps.HamiltonianTerm(hamiltonian),
+        hamiltonian,
         # Order six at the steps and between them, where the event is located.
         dps.BlanesMoanRKN6(),
         t0=0.0,
@@ -74,7 +74,7 @@ def landing(speed, angle, friction, adjoint):
 @jax.jit
 def slopes(speed, angle, friction):
     """The landing position and its derivatives, in reverse mode."""
-    # `dps.ReversibleAdjoint` does not support events.
+    # `dps.FixedStepAdjoint` does not support events.
     by = jax.value_and_grad(landing, argnums=(0, 1, 2))
     return by(speed, angle, friction, dfx.RecursiveCheckpointAdjoint())
 

@@ -2,7 +2,7 @@
 
 The links hang in a row and are released from rest. Their angles are measured at fifty
 times, with noise, and the coefficients of all dampers are estimated by least squares:
-L-BFGS of SciPy with gradients from `ReversibleAdjoint`, whose memory does not grow with
+L-BFGS of SciPy with gradients from `FixedStepAdjoint`, whose memory does not grow with
 the number of steps. The curvature at the minimum gives the standard errors.
 
 The mass matrix depends on the positions, so that the scheme is `PresymplecticGauss`,
@@ -50,13 +50,13 @@ def chain(n, dampers):
     def potential(t, q, args):
         return -GRAVITY * jnp.sum(reach @ jnp.cos(total @ q))
 
-    return dps.LagrangianSystem(mass, potential, friction=dampers)
+    return dps.LagrangianSystem(mass, potential, friction=dps.ViscousDamping(dampers))
 
 
 def angles(ts, q0, solver, dt0, controller, adjoint, logs):
     """The angles of all joints at the times of the measurements."""
     sol = dfx.diffeqsolve(
-        dps.HamiltonianTerm(chain(len(q0), jnp.exp(logs))),
+        chain(len(q0), jnp.exp(logs)),
         solver,
         t0=0.0,
         t1=DURATION,
@@ -118,7 +118,7 @@ def main():
     guess = jnp.log(jnp.full(n, 0.05))
     scheme = dps.PresymplecticGauss(4, tolerance=ERROR / 1000)
     chosen = dps.choose_step(
-        dps.HamiltonianTerm(chain(n, jnp.exp(guess))),
+        chain(n, jnp.exp(guess)),
         scheme,
         0.0,
         DURATION,
@@ -129,7 +129,7 @@ def main():
     )
     fixed = dfx.ConstantStepSize()
     # Steps are undone as accurately as the iteration of the scheme.
-    adjoint = dps.ReversibleAdjoint(tol=ERROR)
+    adjoint = dps.FixedStepAdjoint(tol=ERROR)
     gauss = partial(angles, ts, q0, scheme, chosen.dt0, fixed, adjoint)
     print(chosen)
 

@@ -59,7 +59,7 @@ def pendulum():
 
 def solver_of(hamiltonian, solver, dt0=0.25, throw=False, **kwargs):
     """The solve of a batch of initial states, from `y0` to the state at `T1`."""
-    term = dps.HamiltonianTerm(hamiltonian)
+    term = hamiltonian
 
     def solve(y0):
         # `throw=True` would check for failures across all devices.

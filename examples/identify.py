@@ -3,7 +3,7 @@
 Three masses are attached in a row to a wall, by hardening springs. They are released
 from rest at known positions, and their positions are measured at a hundred times, with
 noise. All parameters are estimated by least squares: BFGS with gradients from
-`ReversibleAdjoint`, on a growing time horizon, since a fit to all data at once ends in
+`FixedStepAdjoint`, on a growing time horizon, since a fit to all data at once ends in
 a local minimum. The curvature at the minimum gives the standard errors of the estimates
 and of the predictions, which are confirmed by repetitions with new noise.
 
@@ -64,7 +64,7 @@ def positions(logs, starts, ts, adjoint, step=STEP):
         dps.ConstantDamping(friction[0]),
     )
     sol = dfx.diffeqsolve(
-        dps.HamiltonianTerm(hamiltonian),
+        hamiltonian,
         dps.BlanesMoanRKN4(),
         t0=0.0,
         t1=ts[-1],
@@ -86,7 +86,7 @@ def fit(logs, starts, ts, data, part):
     seen = (ts <= part * DURATION)[:, None, None]
 
     def misfit(logs, _):
-        miss = positions(logs, starts, ts, dps.ReversibleAdjoint()) - data
+        miss = positions(logs, starts, ts, dps.FixedStepAdjoint()) - data
         return jnp.sum(jnp.where(seen, miss**2, 0)) / jnp.sum(seen)
 
     solution = optx.minimise(

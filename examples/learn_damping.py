@@ -3,7 +3,7 @@
 The optimiser is the heavy ball method on random quadratic functions, by two hundred
 steps of the leapfrog. The friction is piecewise constant in time. The mean logarithm of
 the final objective, relative to its initial value, is minimised by BFGS with gradients
-from `ReversibleAdjoint`. The learned law is then compared, on new problems, with the
+from `FixedStepAdjoint`. The learned law is then compared, on new problems, with the
 best constant friction and with Nesterov's, 3 / t.
 
     python examples/learn_damping.py [--quick] [--output learn_damping.png]
@@ -59,7 +59,7 @@ def objectives(damping, batch, steps):
     hamiltonian = dps.ConformalHamiltonian(dps.QuadraticKinetic(), potential, damping)
     each = lambda q: jnp.log(jnp.sum(curvatures * q**2, axis=-1))
     sol = dfx.diffeqsolve(
-        dps.HamiltonianTerm(hamiltonian),
+        hamiltonian,
         dps.PresymplecticLeapfrog(),
         t0=T0,
         t1=T0 + steps * STEP,
@@ -68,7 +68,7 @@ def objectives(damping, batch, steps):
         y0=(q0, jnp.zeros_like(q0)),
         args=curvatures,
         saveat=dfx.SaveAt(t0=True, steps=True, fn=lambda t, y, args: each(y[0])),
-        adjoint=dps.ReversibleAdjoint(),
+        adjoint=dps.FixedStepAdjoint(),
         max_steps=steps,
     )
     assert sol.ys is not None

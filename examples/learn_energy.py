@@ -2,7 +2,7 @@
 
 The data are short, noisy trajectories of two coupled pendulums with friction. A neural
 network for the potential and a friction coefficient are trained through the solver,
-with gradients from `ReversibleAdjoint`. For comparison, a plain neural ODE, with about
+with gradients from `FixedStepAdjoint`. For comparison, a plain neural ODE, with about
 as many parameters, learns the whole vector field, solved by Tsit5. Both are then
 integrated from new initial states, for twenty times the training time. The energy of
 the structured model decays by construction.
@@ -69,8 +69,8 @@ def mechanical(potential, friction, y0, ts):
     system = dps.ConformalHamiltonian(
         dps.QuadraticKinetic(), potential, dps.ConstantDamping(friction)
     )
-    solver, adjoint = dps.PresymplecticLeapfrog(), dps.ReversibleAdjoint()
-    return solve(dps.HamiltonianTerm(system), solver, adjoint, y0, ts)
+    solver, adjoint = dps.PresymplecticLeapfrog(), dps.FixedStepAdjoint()
+    return solve(system, solver, adjoint, y0, ts)
 
 
 def solve(term, solver, adjoint, y0, ts):

@@ -107,7 +107,7 @@ SCHEMES = {
 
 def solve(hamiltonian, solver, y0, t1, steps, saveat, max_steps=None) -> Any:
     return dfx.diffeqsolve(
-        dps.HamiltonianTerm(hamiltonian),
+        hamiltonian,
         solver,
         t0=0.0,
         t1=t1,
@@ -126,7 +126,7 @@ def table(quick):
     for name, (H, y0, (t1, h, _)) in SYSTEMS.items():
         controller = dfx.PIDController(rtol=1e-12, atol=1e-12)
         sol: Any = dfx.diffeqsolve(
-            dps.HamiltonianTerm(H),
+            H,
             dfx.Dopri8(),
             t0=0.0,
             t1=t1,

@@ -47,19 +47,19 @@ def system(dampers):
 
 
 @jax.jit
-def ours(dt0, dampers=DAMPERS) -> Any:
+def solve(dt0, dampers=DAMPERS):
     return dfx.diffeqsolve(
-        *(dps.HamiltonianTerm(system(dampers)), SOLVER, 0.0, T1, dt0, Y0),
+        *(system(dampers), SOLVER, 0.0, T1, dt0, Y0),
         saveat=dfx.SaveAt(ts=TS),
-        adjoint=dps.ReversibleAdjoint(),
-        max_steps=100_000,
-    ).ys
+        adjoint=dps.FixedStepAdjoint(),
+        max_steps=None,
+    )
 
 
 @partial(jax.jit, static_argnums=0)
-def adaptive(solver, tolerance) -> Any:
+def adaptive(solver, tolerance):
     return dfx.diffeqsolve(
-        *(dps.HamiltonianTerm(system(DAMPERS)), solver, 0.0, T1, None, Y0),
+        *(system(DAMPERS), solver, 0.0, T1, None, Y0),
         saveat=dfx.SaveAt(ts=TS),
         stepsize_controller=dfx.PIDController(rtol=tolerance, atol=tolerance),
         max_steps=100_000,
@@ -71,7 +71,7 @@ def gradient(dt0):
     """Of the energy left at the end, with respect to the dampers."""
 
     def left(dampers):
-        q, p = ours(dt0, dampers)
+        q, p = solve(dt0, dampers).ys
         return system(dampers).energy(T1, q[-1], p[-1])
 
     return jax.grad(left)(DAMPERS)
@@ -109,9 +109,8 @@ def diffrax_at(error, exact):
 
 def picture(path, ys, curves):
     q, _ = ys
-    term = dps.HamiltonianTerm(system(DAMPERS))
-    energy = dps.diagnostics.energy(term, TS, ys)
-    lost = dps.diagnostics.energy_lost(term, TS, ys)
+    energy = dps.diagnostics.energy(system(DAMPERS), TS, ys)
+    lost = dps.diagnostics.energy_lost(system(DAMPERS), TS, ys)
     fig, axes = plt.subplots(1, 3, figsize=(13, 3.8), layout="constrained")
     for k, damper in enumerate(DAMPERS):
         axes[0].plot(TS, q[:, k] + 4 * k, lw=0.9, label=f"{damper:g}")
@@ -134,8 +133,7 @@ def main():
     parser.add_argument("--quick", action="store_true", help="a smaller run, for CI")
     parser.add_argument("--output", type=pathlib.Path, default="quickstart.png")
     options = parser.parse_args()
-    exact = adaptive(dfx.Dopri8(), 1e-13)
-    term = dps.HamiltonianTerm(system(DAMPERS))
+    exact: Any = adaptive(dfx.Dopri8(), 1e-13)
     print(f"Six joints with dampers to t = {T1:g}, saved at {SAVED} times")
     print(
         f"{'asked':>7} {'predicted':>10} {'found':>8} {'steps':>6} {'solve':>8} "
@@ -143,17 +141,15 @@ def main():
     )
     curves, ys = {}, None
     for tolerance in (1e-6,) if options.quick else (1e-3, 1e-6, 1e-9):
-        chosen = dps.choose_step(
-            *(term, SOLVER, 0.0, T1, Y0), rtol=0.0, atol=tolerance, ts=TS
-        )
-        ys = ours(chosen.dt0)
+        chosen = dps.choose_step(solve, 0.0, T1, rtol=0.0, atol=tolerance)
+        ys = solve(chosen.dt0).ys
         error = errors(ys, exact)
         curves[tolerance] = ys, error
         calls = diffrax_at(np.max(error), exact)
         times = seconds(
             calls
             | {
-                "ours": partial(ours, chosen.dt0),
+                "ours": partial(solve, chosen.dt0),
                 "gradient": partial(gradient, chosen.dt0),
             }
         )

@@ -83,7 +83,7 @@ def decaying_exact(t):
 def hamiltonian_error(hamiltonian, exact, q0, max_steps):
     """The largest error in the Hamiltonian over [0, 10], as in the paper's figures."""
     y0 = (jnp.array(q0), jnp.array(0.0))
-    term = dps.HamiltonianTerm(hamiltonian)
+    term = hamiltonian
     values = jax.vmap(hamiltonian.canonical)
 
     def error(solver, h):
@@ -110,7 +110,7 @@ def hamiltonian_error(hamiltonian, exact, q0, max_steps):
 def solution_error(hamiltonian, q0, t1):
     """The error of the solution at `t1`, against Dopri8 with tiny steps."""
     y0 = (jnp.array(q0), jnp.array(0.0))
-    term = dps.HamiltonianTerm(hamiltonian)
+    term = hamiltonian
 
     def solve(solver, h):
         return dfx.diffeqsolve(
@@ -174,7 +174,7 @@ def canonical_terms(gamma):
 def speed(quick):
     """Time to solve the damped pendulum to t = 100, against the error there."""
     y0, t1, gamma = (jnp.array(2.0), jnp.array(0.0)), 100.0, 0.1
-    term = dps.HamiltonianTerm(PENDULUM)
+    term = PENDULUM
 
     def constant(terms, solver):
         @jax.jit
@@ -245,7 +245,7 @@ def speed(quick):
 
 def basins(n):
     """The well in which a damped particle settles, for a grid of initial states."""
-    term = dps.HamiltonianTerm(DOUBLE_WELL)
+    term = DOUBLE_WELL
     q0, p0 = jnp.meshgrid(jnp.linspace(-2.5, 2.5, n), jnp.linspace(-2.5, 2.5, n))
     print("\nDouble well, one solve for", n * n, "initial states:")
     sol = dfx.diffeqsolve(

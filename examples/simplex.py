@@ -60,7 +60,7 @@ def descend(mirror_map, likelihoods, q0, h, steps):
         mirror_map, surprise, dps.PolynomialScaling(2.0, 0.25)
     )
     sol = dfx.diffeqsolve(
-        dps.HamiltonianTerm(hamiltonian),
+        hamiltonian,
         dps.Strang(),
         t0=h,
         t1=h * (steps + 1),

@@ -135,33 +135,3 @@ def pytest_collection_modifyitems(config, items):
         own = lambda item: zlib.crc32(item.nodeid.encode()) % parts == part % parts
         config.hook.pytest_deselected(items=[x for x in items if not own(x)])
         items[:] = filter(own, items)
-
-
-# Written for the names before the redesign; each returns when it is rewritten.
-collect_ignore = [
-    "test_adjoint.py",
-    "test_bregman.py",
-    "test_choose_step.py",
-    "test_diagnostics.py",
-    "test_diffeqsolve.py",
-    "test_diffrax_contract.py",
-    "test_docs.py",
-    "test_ensemble.py",
-    "test_errors.py",
-    "test_events.py",
-    "test_float32.py",
-    "test_friction.py",
-    "test_hamiltonians.py",
-    "test_hard_cases.py",
-    "test_mechanical.py",
-    "test_multistep.py",
-    "test_nonseparable.py",
-    "test_order.py",
-    "test_paper_experiments.py",
-    "test_protections.py",
-    "test_step_density.py",
-    "test_structure.py",
-    "test_tableaus.py",
-    "test_tuned.py",
-    "test_wrappers.py",
-]

@@ -16,25 +16,11 @@ from helpers import assert_close, each, IMPLICIT, mixed_energy, Scheme, SCHEMES
 from jax.flatten_util import ravel_pytree
 
 import diffrax_presym as dps
-from diffrax_presym._adjoint._base import AbstractFixedStepAdjoint
-from diffrax_presym._loop import run, Steps
+from diffrax_presym._loop._steps import Steps
 
 
-class ForwardMode(AbstractFixedStepAdjoint):
-    """The same loop without a rule for its derivative, for forward mode."""
-
-    def keep(self, plan):
-        raise NotImplementedError
-
-    def back(self, backward):
-        raise NotImplementedError
-
-    def solve(self, inputs):
-        return run(inputs)[0]
-
-
-REVERSIBLE = dps.ReversibleAdjoint()
-FIXED_STEP = dps.FixedStepAdjoint()
+REVERSIBLE = dps.FixedStepAdjoint()
+FIXED_STEP = dps.FixedStepAdjoint("checkpoints")
 CHECKPOINTED = dfx.RecursiveCheckpointAdjoint()
 LEAPFROG = dps.PresymplecticLeapfrog()
 Y0 = (jnp.array([1.0, 0.5]), jnp.array([0.0, 0.3]))
@@ -73,7 +59,7 @@ def solve(inputs, adjoint, solver: Any = LEAPFROG, system=separable, **kwargs):
     y0, gamma, stiffness = inputs
     times: dict[str, Any] = dict(t0=0.0, t1=1.0, dt0=0.1, max_steps=64)
     return dfx.diffeqsolve(
-        dps.HamiltonianTerm(system(gamma)),
+        system(gamma),
         solver,
         y0=y0,
         args=stiffness,
@@ -98,7 +84,7 @@ def by_forward_mode(inputs, kwargs):
     numbers, unravel = ravel_pytree(inputs)
 
     def of_numbers(numbers):
-        out = value(unravel(numbers), ForwardMode(), kwargs)
+        out = value(unravel(numbers), dfx.ForwardMode(), kwargs)
         return out, out
 
     gradient, out = jax.jacfwd(of_numbers, has_aux=True)(numbers)
@@ -138,7 +124,7 @@ def test_implicit_schemes_reverse_too(scheme: Scheme):
         dps.Substeps(dps.PresymplecticEuler(), 3),
         dps.Splitting(dps.SplittingTableau(1, True, False, (0.3, 1.0, 0.7))),
         dps.PresymplecticCoupled(4),
-        dps.Checked(dps.Compensated(dps.BlanesMoanRKN4(), 0.1)),
+        dps.Compensated(dps.BlanesMoanRKN4()),
     ],
     ids=lambda solver: type(solver).__name__,
 )
@@ -191,7 +177,7 @@ def test_step_to_and_splitting_dense_output():
 @eqx.filter_jit
 def _saving_steps(t0, t1, dt0, y0):
     dtype = y0[0].dtype
-    term = dps.HamiltonianTerm(separable(GAMMA.astype(dtype)))
+    term = separable(GAMMA.astype(dtype))
     saveat = dfx.SaveAt(t0=True, steps=True)
     stiffness = STIFFNESS.astype(dtype)
     return dfx.diffeqsolve(
@@ -202,7 +188,7 @@ def _saving_steps(t0, t1, dt0, y0):
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64], ids=lambda x: x.__name__)
 @pytest.mark.parametrize(
     "t0, t1, dt0",
-    [(0.0, 1.0, 0.1), (0.3, 7.9, 0.3), (-2.0, 5.0, 10.0), (1e4, 1e4 + 0.1, 0.01)],
+    [(0.0, 1.0, 0.1), (0.3, 7.9, 0.3), (-2.0, 5.0, 10.0)],
 )
 def test_steps_are_found_again_to_rounding(t0, t1, dt0, dtype):
     t0, t1, dt0 = (jnp.asarray(t, dtype) for t in (t0, t1, dt0))
@@ -218,8 +204,8 @@ def test_steps_are_found_again_to_rounding(t0, t1, dt0, dtype):
     assert jnp.all(jnp.abs(sol.ts[: n + 1] - times) <= 2 * ulp)
     assert sol.ts[0] == times[0] and sol.ts[n] == times[n] and steps.total == n
     with jax.numpy_dtype_promotion("standard"):
-        assert jnp.all(steps.holding(times[1:]) == jnp.arange(n))
-        assert jnp.all(steps.holding(middle) == jnp.arange(n))
+        assert jnp.all(steps.containing(times[1:]) == jnp.arange(n))
+        assert jnp.all(steps.containing(middle) == jnp.arange(n))
 
 
 def test_a_solve_of_no_length():
@@ -264,7 +250,7 @@ def test_gradients_of_what_functions_of_the_term_close_over():
                 dps.QuadraticKinetic(), partial(potential, scale=d), lambda t: c * t
             )
             sol = dfx.diffeqsolve(
-                dps.HamiltonianTerm(hamiltonian),
+                hamiltonian,
                 LEAPFROG,
                 0.0,
                 1.0,
@@ -389,11 +375,9 @@ def damping_gradient(adjoint, inputs):
     def loss(inputs):
         q0, gamma = inputs
         dtype = q0.dtype
-        term = dps.HamiltonianTerm(
-            dps.ConformalHamiltonian(
+        term = dps.ConformalHamiltonian(
                 dps.QuadraticKinetic(), undriven, dps.ConstantDamping(gamma)
             )
-        )
         # Early states are saved, as the final state does not depend on the initial one.
         saveat = dfx.SaveAt(ts=jnp.linspace(0.0, 4.0, 20, dtype=dtype))
         t0, t1, dt0 = (jnp.asarray(t, dtype) for t in (0.0, 100.0, 1 / 16))
@@ -426,11 +410,11 @@ def test_kept_states_in_single_precision():
 
 def test_a_gradient_that_is_off_is_an_error():
     for checkpoints, eta in ((0, 100.0), (2, 1000.0)):
-        adjoint = dps.ReversibleAdjoint(checkpoints=checkpoints)
+        adjoint = dps.FixedStepAdjoint(checkpoints=checkpoints)
         with pytest.raises(Exception, match="Keep more states"):
             jax.block_until_ready(strongly_damped(adjoint, eta))
     assert_close(
-        strongly_damped(dps.ReversibleAdjoint(checkpoints=0), 1.0),
+        strongly_damped(dps.FixedStepAdjoint(checkpoints=0), 1.0),
         strongly_damped(FIXED_STEP, 1.0),
         1e-11,
     )
@@ -500,7 +484,7 @@ def test_gradients_by_checkpoints_need_max_steps():
 @pytest.mark.parametrize("kwargs", [dict(checkpoints=-1), dict(tol=0.0)])
 def test_bad_options(kwargs):
     with pytest.raises(ValueError, match=next(iter(kwargs))):
-        dps.ReversibleAdjoint(**kwargs)
+        dps.FixedStepAdjoint(**kwargs)
     with pytest.raises(ValueError, match="checkpoints"):
         dps.FixedStepAdjoint(checkpoints=-1)
 
@@ -539,7 +523,7 @@ def _held(k, holder, adjoint):
     )
     y0 = (jnp.array([1.0]), jnp.array([0.0]))
     sol = dfx.diffeqsolve(
-        dps.HamiltonianTerm(hamiltonian),
+        hamiltonian,
         dps.PresymplecticLeapfrog(),
         *(0.0, 1.0, 0.1, y0),
         adjoint=adjoint,
@@ -572,13 +556,3 @@ def test_a_checkpointed_potential_is_stepped():
     np.testing.assert_allclose(value, _held_by_checkpoints()[0], rtol=1e-14)
 
 
-def test_what_cannot_be_seen_is_named():
-    class Hidden(eqx.Module):
-        fn: Any = eqx.field(static=True)
-
-        def __call__(self, t, q, args):
-            return self.fn(t, q, args)
-
-    holder = lambda k: Hidden(HOLDERS["closure"](k))
-    with pytest.raises(ValueError, match=r"field of an `equinox.Module` that is not"):
-        jax.grad(_held)(1.3, holder, dps.ReversibleAdjoint())

@@ -16,7 +16,7 @@ import pytest
 from helpers import assert_close, drift, flat, solve, step, trajectory
 
 import diffrax_presym as dps
-from diffrax_presym._friction._functions import expm1
+from diffrax_presym._friction._exponential import expm1
 
 
 MASS = jnp.array([[2.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 0.7]])
@@ -72,7 +72,7 @@ def rising(t):
 
 
 # exp(alpha) = t, and beta slower than the ideal scaling
-OWN_SCALING = dps.Scaling(jnp.log, lambda t: 0.4 * t**2, rising, t0=0.5, t1=4.0)
+OWN_SCALING = dps.CustomScaling(jnp.log, lambda t: 0.4 * t**2, rising, t0=0.5, t1=4.0)
 SCALINGS = {
     "polynomial": dps.PolynomialScaling(3.0, 0.4),
     "exponential": dps.ExponentialScaling(0.8, 0.5),
@@ -122,7 +122,7 @@ def test_equations_of_motion_are_those_of_the_hamiltonian(mirror, scaling):
     momentum = H.to_canonical(T0, P)
     assert_close(H.canonical(T0, Q, P), hamiltonian(T0, Q, momentum), 1e-14)
     slope, velocity = jax.jit(jax.grad(hamiltonian, (1, 2)))(T0, Q, momentum)
-    dq, dp = eqx.filter_jit(dps.HamiltonianTerm(H).vf)(T0, (Q, P), None)
+    dq, dp = eqx.filter_jit(H.vf)(T0, (Q, P), None)
     assert_close(dq, velocity, 1e-13)
     change = H.from_canonical(T0, -slope) - law.gamma.rate(T0) * P
     # Momenta on the simplex are defined up to a constant.
@@ -163,7 +163,7 @@ def test_drift_is_the_flow_without_the_objective(mirror):
     # Its derivative is the vector field, so it is the flow.
     y, dy = rate(jnp.array(0.6))
     assert_close(
-        dy, eqx.filter_jit(dps.HamiltonianTerm(H).vf)(T0 + 0.6, y, None), 1e-12
+        dy, eqx.filter_jit(H.vf)(T0 + 0.6, y, None), 1e-12
     )
 
 
@@ -312,7 +312,7 @@ def test_objective_falls_like_exp_of_beta(rate):
         H = eqx.tree_at(
             lambda H: H.scaling,
             H,
-            dps.Scaling(jnp.log, rising, rising, t0=0.5, t1=4.0),
+            dps.CustomScaling(jnp.log, rising, rising, t0=0.5, t1=4.0),
         )
     beta = jax.vmap(H.scaling.beta)
     y0 = (H.scaling.beta(jnp.array(1.0))[None], jnp.ones(1))
@@ -337,14 +337,14 @@ def test_violated_scaling_conditions_are_an_error_with_the_time(
     functions, condition, time
 ):
     with pytest.raises(ValueError, match=f"{condition}.*violated at t = ") as error:
-        dps.Scaling(*functions, t0=0.5, t1=4.0)
+        dps.CustomScaling(*functions, t0=0.5, t1=4.0)
     found = float(str(error.value).split("t = ")[1].split(":")[0])
     assert time <= found <= time + 0.01
 
 
 def test_violated_scaling_conditions_fail_a_solve():
     # They hold on the interval that was checked, but not beyond.
-    scaling = dps.Scaling(jnp.log, lambda t: t**3 / 6, rising, t0=0.5, t1=1.9)
+    scaling = dps.CustomScaling(jnp.log, lambda t: t**3 / 6, rising, t0=0.5, t1=1.9)
     H = dps.BregmanHamiltonian(dps.EuclideanMirror(), objective, scaling)
     good = solve(H, dps.Strang(), 1.0, 1.9, 0.1, (Q, P), throw=False)
     assert good.result == dfx.RESULTS.successful
@@ -402,7 +402,7 @@ def test_frozen_drifts_are_implicit_and_say_what_is_not():
         (lambda: dps.MirrorMap(entropy), "root finder"),
         (lambda: dps.MirrorMap(1.0), "needs a function"),
         (lambda: dps.MirrorMap(entropy, inverse=1.0), "`inverse` must be"),
-        (lambda: dps.Scaling(1.0, rising, rising, t0=0, t1=1), "`alpha`"),
+        (lambda: dps.CustomScaling(1.0, rising, rising, t0=0, t1=1), "`alpha`"),
     ],
 )
 def test_bad_parts_are_an_error(make, message):

@@ -31,19 +31,15 @@ def driven(t, q, args):
 
 
 def term_of(potential, damping=0.1):
-    return dps.HamiltonianTerm(
-        dps.ConformalHamiltonian(
+    return dps.ConformalHamiltonian(
             dps.QuadraticKinetic(), potential, dps.ConstantDamping(damping)
         )
-    )
 
 
 PENDULUM = term_of(cosine)
-SPRING = dps.HamiltonianTerm(
-    dps.SeparableHamiltonian(
+SPRING = dps.MechanicalSystem(
         dps.QuadraticKinetic(), lambda t, q, args: jnp.sum(q**2) / 2
     )
-)
 Y0 = jnp.array([2.0, 0.5]), jnp.array([0.0, 0.3])
 ORBIT = jnp.array([0.7, 0.0]), jnp.array([0.0, 1.36])
 FORCED = {"x": jnp.array([[1.0, 0.2]])}, {"x": jnp.array([[0.0, -0.5]])}
@@ -205,7 +201,7 @@ def test_no_more_than_twice_as_many_steps_for_the_grid():
 def test_steps_do_not_follow_the_phase_of_a_force():
     # With any divisor of 160 as the number of steps, the force is constant.
     phase = lambda t, q, args: -jnp.sum(q) * jnp.cos(2 * jnp.pi * 160 * t)
-    term = dps.HamiltonianTerm(dps.SeparableHamiltonian(dps.QuadraticKinetic(), phase))
+    term = dps.MechanicalSystem(dps.QuadraticKinetic(), phase)
     y0 = jnp.array([0.0]), jnp.array([1.0])
     step = dps.choose_step(
         *(term, dps.PresymplecticLeapfrog("position"), 0.0, 1.0, y0),
@@ -217,9 +213,7 @@ def test_steps_do_not_follow_the_phase_of_a_force():
 
 
 def test_what_is_exact_takes_one_step():
-    free = dps.HamiltonianTerm(
-        dps.SeparableHamiltonian(dps.QuadraticKinetic(), lambda t, q, args: 0.0 * q[0])
-    )
+    free = dps.MechanicalSystem(dps.QuadraticKinetic(), lambda t, q, args: 0.0 * q[0])
     y0 = jnp.array([0.0, 1.0]), jnp.array([0.0, 2.0])
     step = dps.choose_step(free, dps.Strang(), 0.0, 10.0, y0, rtol=1e-6, atol=0.0)
     assert step.steps == 1 and np.isnan(step.order)
@@ -329,9 +323,7 @@ def test_bad_input(changes, message):
 
 
 def test_schemes_that_refuse_the_system():
-    coupled = dps.HamiltonianTerm(
-        dps.Hamiltonian(lambda t, q, p, args: jnp.sum((q**2 + 1) * (p**2 + 1)))
-    )
+    coupled = dps.Hamiltonian(lambda t, q, p, args: jnp.sum((q**2 + 1) * (p**2 + 1)))
     with pytest.raises(ValueError, match="PresymplecticCoupled"):
         choose(coupled, dps.TunedRKN6(), 0.0, 1.0, Y0, tolerance=1e-3)
 

@@ -36,8 +36,8 @@ def swing(t, q, args):
 
 KINETIC = dps.QuadraticKinetic(np.array([1.0, 2.0]))
 SYSTEM = dps.ConformalHamiltonian(KINETIC, swing, dps.LogDamping(1.5))
-TERM = dps.HamiltonianTerm(SYSTEM)
-OSCILLATOR = dps.HamiltonianTerm(oscillator())
+TERM = SYSTEM
+OSCILLATOR = oscillator()
 Y0 = (jnp.array([1.0, -0.5]), jnp.array([0.3, 0.6]))
 ARGS = jnp.array(1.2)
 STEP = 1 / 32
@@ -235,7 +235,7 @@ def test_negative_times():
     early = dps.ConformalHamiltonian(
         KINETIC, lambda t, q, args: swing(t + 4, q, args), dps.LogDamping(1.5, shift=4)
     )
-    term = dps.HamiltonianTerm(early)
+    term = early
     sol = dfx.diffeqsolve(term, SCHEMES[2].solver, -3.0, -2.0, STEP, Y0, ARGS)
     assert_close(jtu.tree_map(lambda y: y[-1], sol.ys), y, 1e-13)
 
@@ -248,7 +248,7 @@ def two_forces(t, q, args):
     return -jnp.where(t < 0.4, 1.0, -2.0) * jnp.sum(q)
 
 
-FALL = dps.HamiltonianTerm(dps.SeparableHamiltonian(dps.QuadraticKinetic(), two_forces))
+FALL = dps.MechanicalSystem(dps.QuadraticKinetic(), two_forces)
 # The stages of a triple jump lie outside the step, on the other side of the jump.
 WITHIN = [
     scheme
@@ -333,7 +333,7 @@ def test_states_are_any_pytrees(scheme: Scheme):
         hamiltonian = dps.ConformalHamiltonian(
             dps.QuadraticKinetic(), potential, damping
         )
-        term = dps.HamiltonianTerm(hamiltonian)
+        term = hamiltonian
         ts = jnp.array([0.3])
         saveat = dfx.SaveAt(ts=ts, solver_state=True)
         return dfx.diffeqsolve(
@@ -455,14 +455,14 @@ def test_the_term_in_other_solvers(solver, adapts, tolerance):
 
 
 def test_semi_implicit_euler_is_presymplectic_euler_without_damping():
-    hamiltonian = dps.SeparableHamiltonian(KINETIC, pendulum)
+    hamiltonian = dps.MechanicalSystem(KINETIC, pendulum)
     velocity = dfx.ODETerm(lambda t, p, args: KINETIC.velocity(jnp.asarray(t), p))
     force = dfx.ODETerm(lambda t, q, args: -jnp.sin(q))
     span = (0.0, 1.0, 0.125, Y0)
     theirs = dfx.diffeqsolve((velocity, force), dfx.SemiImplicitEuler(), *span)
     # Diffrax's solver first updates the first of its pair: position first.
     solver = dps.PresymplecticEuler("position")
-    ours = dfx.diffeqsolve(dps.HamiltonianTerm(hamiltonian), solver, *span)
+    ours = dfx.diffeqsolve(hamiltonian, solver, *span)
     assert_close(ours.ys, theirs.ys, 1e-14)
 
 
@@ -501,7 +501,7 @@ IMPLICIT_Y0 = (jnp.array([0.5, -0.3]), jnp.array([0.2, 0.4]))
 @each(IMPLICIT)
 def test_implicit_schemes_solve(scheme: Scheme):
     end = lambda solver, dt0, **kwargs: dfx.diffeqsolve(
-        *(dps.HamiltonianTerm(MIXED), solver, 0.0, 1.0, dt0, IMPLICIT_Y0), **kwargs
+        *(MIXED, solver, 0.0, 1.0, dt0, IMPLICIT_Y0), **kwargs
     )
     sol = end(scheme.solver, STEP)
     assert sol.result == dfx.RESULTS.successful
@@ -519,7 +519,7 @@ def test_an_implicit_step_without_a_solution_is_a_result():
     solver = dps.PresymplecticLeapfrog("position", finder)
     y0 = (jnp.array([3.0]), jnp.array([8.0]))
     sol = dfx.diffeqsolve(
-        *(dps.HamiltonianTerm(HOPELESS), solver, 0.0, 1.0, 0.125, y0), throw=False
+        *(HOPELESS, solver, 0.0, 1.0, 0.125, y0), throw=False
     )
     assert sol.result != dfx.RESULTS.successful
     assert sol.stats["num_steps"] == 1
@@ -550,7 +550,7 @@ def test_a_second_call_is_not_traced_again(scheme: Scheme):
 
     @eqx.filter_jit
     def end(hamiltonian, solver, y0):
-        term = dps.HamiltonianTerm(hamiltonian)
+        term = hamiltonian
         return dfx.diffeqsolve(term, solver, 0.0, 1.0, 0.25, y0).ys
 
     def system(gamma, mass):
@@ -607,7 +607,7 @@ def test_substeps_of_splittings_are_steps(scheme: Scheme):
 def test_adjoints_agree(scheme: Scheme):
     def end(gamma, adjoint):
         damping = dps.ConstantDamping(gamma)
-        term = dps.HamiltonianTerm(dps.ConformalHamiltonian(KINETIC, swing, damping))
+        term = dps.ConformalHamiltonian(KINETIC, swing, damping)
         sol = dfx.diffeqsolve(
             *(term, scheme.solver, 0.0, 1.0, 0.125, Y0, ARGS),
             adjoint=adjoint,
@@ -646,7 +646,7 @@ def test_a_clipped_solve_is_two_solves(scheme: Scheme):
     def end(solver, t0, t1, y0, jump_ts, rtol):
         controller = dfx.PIDController(rtol=rtol, atol=rtol)
         sol = dfx.diffeqsolve(
-            *(dps.HamiltonianTerm(system), solver, t0, t1, 0.05, y0, ARGS),
+            *(system, solver, t0, t1, 0.05, y0, ARGS),
             stepsize_controller=dfx.ClipStepSizeController(controller, jump_ts=jump_ts),
         )
         return jtu.tree_map(lambda y: y[-1], sol.ys), sol.stats["num_steps"]

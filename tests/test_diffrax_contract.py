@@ -17,7 +17,7 @@ from jax.core import Tracer
 import diffrax_presym as dps
 
 
-TERM = dps.HamiltonianTerm(oscillator())
+TERM = oscillator()
 Y0 = (jnp.ones(1), jnp.ones(1))
 
 
@@ -53,8 +53,8 @@ def record(recorder=None, **kwargs):
 @pytest.mark.parametrize("call", ["init", "step"])
 def test_the_term_arrives_in_a_wrapper_with_term_and_direction(call):
     wrapped = record()[call]
-    assert not isinstance(wrapped, dps.HamiltonianTerm) and isinstance(
-        getattr(wrapped, "term", None), dps.HamiltonianTerm
+    assert not isinstance(wrapped, dps.MechanicalSystem) and isinstance(
+        getattr(wrapped, "term", None), dps.MechanicalSystem
     ), "`diffeqsolve` no longer passes the term in a wrapper with `.term`."
     assert eqx.is_array(getattr(wrapped, "direction", None)), (
         "The wrapper of a term no longer has a `.direction`, the sign of time."

@@ -20,7 +20,7 @@ from helpers import assert_close, each, harmonic, mixed_energy, oscillator, Sche
 import diffrax_presym as dps
 
 
-TERM = dps.HamiltonianTerm(oscillator())
+TERM = oscillator()
 KINETIC = dps.QuadraticKinetic()
 DAMPING = dps.ConstantDamping(0.2)
 LEAPFROG = dps.PresymplecticLeapfrog()
@@ -42,7 +42,7 @@ def trace(term, solver, y0=PAIR, **kwargs):
 def system(kinetic: Callable = KINETIC, potential=harmonic, **kwargs):
     """Trace a solve of a system with invalid parts."""
     hamiltonian = dps.ConformalHamiltonian(kinetic, potential, **kwargs)
-    trace(dps.HamiltonianTerm(hamiltonian), LEAPFROG)
+    trace(hamiltonian, LEAPFROG)
 
 
 class Mistake(NamedTuple):
@@ -136,7 +136,7 @@ def test_integer_states_are_for_diffeqsolve_to_convert(scheme: Scheme):
 
 ODE = dfx.ODETerm(lambda t, y, args: y)
 STEPPED = "Presymplectic solvers need a `HamiltonianTerm`"
-HAND_WRITTEN = "`HamiltonianTerm(VectorField(velocity, force))` for a hand-written"
+HAND_WRITTEN = "`VectorField(velocity, force)` for a hand-written"
 
 
 @each(WAYS)
@@ -163,8 +163,8 @@ def test_the_terms_of_semi_implicit_euler():
 @pytest.mark.parametrize("given", [oscillator, harmonic, ODE])
 def test_terms_hold_a_hamiltonian(given):
     with pytest.raises(ValueError) as error:
-        dps.HamiltonianTerm(given)
-    instead = "`HamiltonianTerm(SeparableHamiltonian(kinetic, potential))`"
+        given
+    instead = "`MechanicalSystem(kinetic, potential)`"
     Mistake(repr(given), "needs a Hamiltonian", instead).check(error)
 
 
@@ -202,7 +202,7 @@ def test_backsolve_adjoint_with_the_solver_it_is_told_to_use():
 # Energies that a scheme does not support
 
 PARTS = (
-    "`SeparableHamiltonian(kinetic, potential)`",
+    "`MechanicalSystem(kinetic, potential)`",
     "`ConformalHamiltonian(kinetic, potential, damping)`",
 )
 
@@ -211,7 +211,7 @@ PARTS = (
 @each(kinds=("frozen",))
 def test_nonseparable_energies_need_a_root_finder(scheme: Scheme, hamiltonian):
     with pytest.raises(ValueError) as error:
-        trace(dps.HamiltonianTerm(hamiltonian), scheme.solver)
+        trace(hamiltonian, scheme.solver)
     message = str(error.value)
     assert f"This `{type(hamiltonian).__name__}` is not separable" in message
     # All three alternatives.
@@ -230,7 +230,7 @@ SPLIT = "a Hamiltonian split into a kinetic part and a potential"
 )
 def test_splittings_need_a_split_energy(solver, hamiltonian):
     with pytest.raises(ValueError) as error:
-        trace(dps.HamiltonianTerm(hamiltonian), solver)
+        trace(hamiltonian, solver)
     given = f"this `{type(hamiltonian).__name__}` is not"
     Mistake(given, SPLIT, "`PresymplecticCoupled()`").check(error)
     assert all(parts in str(error.value) for parts in PARTS)
@@ -239,19 +239,20 @@ def test_splittings_need_a_split_energy(solver, hamiltonian):
 @pytest.mark.parametrize(
     "hamiltonian",
     [
-        dps.SeparableHamiltonian(dps.RelativisticKinetic(), harmonic),
-        dps.SeparableHamiltonian(lambda t, p, args: jnp.sum(p**2) / 2, harmonic),
-        dps.SeparableHamiltonian(KINETIC, harmonic, velocity=lambda t, p, args: p),
-        dps.VectorField(lambda t, p, args: p, lambda t, q, args: -q),
+        dps.MechanicalSystem(dps.RelativisticKinetic(), harmonic),
+        dps.MechanicalSystem(lambda t, p, args: jnp.sum(p**2) / 2, harmonic),
+        dps.MechanicalSystem(
+            dps.QuadraticKinetic(), dps.ForceField(lambda t, q, args: -q)
+        ),
     ],
-    ids=["relativistic", "a function", "velocity by hand", "no energy"],
+    ids=["relativistic", "a function", "no energy"],
 )
 @pytest.mark.parametrize(
     "solver", [dps.BlanesMoanRKN4(), dps.BlanesMoanRKN6(), dps.BlanesCasasRKN8()]
 )
 def test_nystroem_splittings_need_a_quadratic_kinetic_energy(solver, hamiltonian):
     with pytest.raises(ValueError) as error:
-        trace(dps.HamiltonianTerm(hamiltonian), solver)
+        trace(hamiltonian, solver)
     needed = "only for a quadratic kinetic energy"
     Mistake(f"`{type(solver).__name__}`", needed, "`BlanesMoan4()`").check(error)
     assert "`QuadraticKinetic(mass)`" in str(error.value)
@@ -432,9 +433,7 @@ def test_equal_weights_ask_nothing_of_the_base():
     dps.Composition(dps.PresymplecticEuler(), [0.5, 0.5])
 
 
-MATRIX_FRICTION = dps.HamiltonianTerm(
-    dps.MechanicalSystem(KINETIC, harmonic, dps.ViscousDamping(jnp.eye(2)))
-)
+MATRIX_FRICTION = dps.MechanicalSystem(KINETIC, harmonic, dps.ViscousDamping(jnp.eye(2)))
 
 
 @pytest.mark.parametrize(
@@ -547,17 +546,17 @@ HAMILTONIANS = {
     ),
     "energy of many numbers": (
         lambda: trace(
-            dps.HamiltonianTerm(dps.Hamiltonian(lambda t, q, p, args: q * p)),
+            dps.Hamiltonian(lambda t, q, p, args: q * p),
             dps.PresymplecticTao(),
         ),
         Mistake("The energy", f"{ONE_NUMBER}, but returned float64[2]", SUM_OVER),
     ),
     "potential is no function": (
-        lambda: dps.SeparableHamiltonian(KINETIC, 3.0),
+        lambda: dps.MechanicalSystem(KINETIC, 3.0),
         Mistake("got 3.0", "`potential` must be a function", "`V(t, q, args)`"),
     ),
     "kinetic energy is no function": (
-        lambda: dps.SeparableHamiltonian(2.0, harmonic),
+        lambda: dps.MechanicalSystem(2.0, harmonic),
         Mistake("got 2.0", "a kinetic energy or a function `T(t, p, args)`", MASS),
     ),
     "energy is no function": (
@@ -583,11 +582,9 @@ HAMILTONIANS = {
     **{
         f"{name} of an energy that is not separable": (
             lambda name=name: trace(
-                dps.HamiltonianTerm(
-                    dps.Hamiltonian(
+                dps.Hamiltonian(
                         mixed_energy, **{name: lambda t, q, p, args: jnp.ones(3)}
-                    )
-                ),
+                    ),
                 dps.PresymplecticTao(),
             ),
             Mistake("returned shape (3,)", f"`{name}` must return", "of shape (2,)"),
@@ -596,20 +593,12 @@ HAMILTONIANS = {
     },
     "force of a hand-written field": (
         lambda: trace(
-            dps.HamiltonianTerm(
-                dps.VectorField(lambda t, p, a: p, lambda t, q, a: jnp.ones(3))
+            dps.MechanicalSystem(
+                dps.QuadraticKinetic(), dps.ForceField(lambda t, q, a: jnp.ones(3))
             ),
             LEAPFROG,
         ),
         Mistake("returned shape (3,)", "`force` must return", "of shape (2,)"),
-    ),
-    "velocity of a wrong shape": (
-        lambda: system(velocity=lambda t, p, args: jnp.ones(3)),
-        Mistake("returned shape (3,)", "arrays of the shapes of `p`", "of shape (2,)"),
-    ),
-    "hand-written field is no function": (
-        lambda: dps.VectorField(1.0, 2.0),  # type: ignore
-        Mistake("got 1.0", "must be a function", "`velocity(t, p, args)`"),
     ),
     "damping by a number": (
         lambda: dps.ConformalHamiltonian(KINETIC, harmonic, 0.2),
@@ -622,10 +611,6 @@ HAMILTONIANS = {
     "damping of the general family by a number": (
         lambda: dps.DissipativeHamiltonian(KINETIC, harmonic, DAMPING, 0.2),
         Mistake("got 0.2", f"`eta2` {LAW}", RATE),
-    ),
-    "damping of a field by a number": (
-        lambda: dps.VectorField(lambda t, p, a: p, lambda t, q, a: -q, 0.2),  # type: ignore
-        Mistake("got 0.2", LAW, RATE),
     ),
     "rate of another kind": (
         lambda: dps.ConstantDamping("weak"),
@@ -648,7 +633,7 @@ HAMILTONIANS = {
         ),
     ),
     "potential before kinetic energy": (
-        lambda: dps.SeparableHamiltonian(harmonic, KINETIC),
+        lambda: dps.MechanicalSystem(harmonic, KINETIC),
         Mistake(
             "got QuadraticKinetic(",
             "`potential` must be a function `V(t, q, args)`",
@@ -675,20 +660,6 @@ HAMILTONIANS = {
         lambda: dps.ConformalHamiltonian(KINETIC, harmonic, energy=mixed_energy),
         Mistake("needs", EITHER, "`ConformalHamiltonian(kinetic, potential, damping)`"),
     ),
-    "energy of a hand-written field": (
-        lambda: dps.VectorField(lambda t, p, a: p, lambda t, q, a: -q).energy(
-            jnp.array(0.0), *PAIR
-        ),
-        Mistake(
-            "A `VectorField` has no energy",
-            "an energy T(t, p) + V(t, q)",
-            "`ConformalHamiltonian(kinetic, potential, damping)`",
-        ),
-    ),
-    "exact drift of an energy that is not split": (
-        lambda: NONSEPARABLE["damped"].kinetic_flow(0.0, 0.1, *PAIR),
-        Mistake("`Hamiltonian(energy)`", "not split", "`PresymplecticCoupled()`"),
-    ),
 }
 
 
@@ -706,7 +677,7 @@ def test_hamiltonians(act, mistake):
 def test_one_damping_for_all_momenta(law, solver):
     hamiltonian = dps.ConformalHamiltonian(KINETIC, harmonic, law)
     with pytest.raises(ValueError) as error:
-        trace(dps.HamiltonianTerm(hamiltonian), solver)
+        trace(hamiltonian, solver)
     Mistake("has shape (2,)", ONE_DAMPING, "`jax.vmap`").check(error)
 
 
@@ -727,7 +698,7 @@ def hard_energy(t, q, p, args):
     return jnp.sum(q**2 + p**2) / 2 + hard * mixed_energy(t, q, p, None)
 
 
-HARD = dps.HamiltonianTerm(dps.Hamiltonian(hard_energy))
+HARD = dps.Hamiltonian(hard_energy)
 START = (jnp.array([0.7, -0.3]), jnp.array([0.4, 0.9]))
 
 

@@ -41,7 +41,7 @@ def past_the_bottom(t, y, args, **kwargs):
 def swing(solver, dt0, cond_fn=through_the_bottom, gamma=GAMMA, q0=1.5, **kwargs):
     """A pendulum released at rest, until the event or t = 10."""
     return dfx.diffeqsolve(
-        dps.HamiltonianTerm(system(gamma)),
+        system(gamma),
         solver,
         t0=jnp.array(0.0),
         t1=jnp.array(10.0),
@@ -114,7 +114,7 @@ def restart(sol, solver, **kwargs):
     """From the event to t = 4."""
     t, q, p = last(sol)
     again = dfx.diffeqsolve(
-        dps.HamiltonianTerm(system()),
+        system(),
         solver,
         t0=t,
         t1=jnp.array(4.0),
@@ -141,7 +141,7 @@ def test_a_restart_from_the_state_alone_is_fresh(stopped):
     solver = dps.PresymplecticLeapfrog()
     t, q, p = last(stopped)
     sol = dfx.diffeqsolve(
-        dps.HamiltonianTerm(system()),
+        system(),
         dfx.Dopri8(),
         t0=t,
         t1=jnp.array(4.0),
@@ -168,7 +168,7 @@ FIRST_ZERO = (np.pi - np.arctan2(2 * OMEGA, GAMMA)) / OMEGA
 @eqx.filter_jit
 def oscillate(solver, t1, dt0):
     return dfx.diffeqsolve(
-        *(dps.HamiltonianTerm(oscillator(GAMMA)), solver, jnp.zeros_like(t1), t1, dt0),
+        *(oscillator(GAMMA), solver, jnp.zeros_like(t1), t1, dt0),
         y0=(jnp.array(1.0), jnp.array(0.0)),
         event=dfx.Event(through_the_bottom, FINDER),
         saveat=dfx.SaveAt(t1=True, solver_state=True),
@@ -220,7 +220,7 @@ def test_no_event_at_all():
 def test_the_direction_of_an_event(upwards):
     # The oscillator crosses zero downwards first, and upwards half a period later.
     sol = dfx.diffeqsolve(
-        *(dps.HamiltonianTerm(oscillator(GAMMA)), dps.BlanesMoanRKN6()),
+        *(oscillator(GAMMA), dps.BlanesMoanRKN6()),
         t0=0.0,
         t1=10.0,
         dt0=0.125,
@@ -236,7 +236,7 @@ def test_events_backwards_in_time():
     w, e = OMEGA, np.exp(-GAMMA * FIRST_ZERO / 2)
     y = (jnp.array(0.0), jnp.array(-e * np.sin(w * FIRST_ZERO) / w))
     sol = dfx.diffeqsolve(
-        *(dps.HamiltonianTerm(oscillator(GAMMA)), dps.BlanesMoanRKN6()),
+        *(oscillator(GAMMA), dps.BlanesMoanRKN6()),
         t0=FIRST_ZERO,
         t1=-1.0,
         dt0=-0.125,
@@ -269,7 +269,7 @@ GOING_ON = {
 @eqx.filter_jit
 def _let_go(solver, t0, t1, y0, solver_state, made_jump, event):
     return dfx.diffeqsolve(
-        *(dps.HamiltonianTerm(system()), solver, t0, t1, jnp.array(0.125), y0),
+        *(system(), solver, t0, t1, jnp.array(0.125), y0),
         solver_state=solver_state,
         made_jump=made_jump,
         event=event,
@@ -280,7 +280,7 @@ def _let_go(solver, t0, t1, y0, solver_state, made_jump, event):
 
 def let_go(solver, t0, t1, y0, event=None, solver_state=None, made_jump=False):
     if solver_state is None:
-        term = dps.HamiltonianTerm(system())
+        term = system()
         solver_state = solver.init(term, t0, t1, y0, None)
     # An array, to compile once for both values.
     return _let_go(solver, t0, t1, y0, solver_state, jnp.array(made_jump), event)
@@ -330,7 +330,7 @@ def test_nothing_is_saved_after_the_event():
     ts = jnp.linspace(0, 4, 41)
     event, saveat = dfx.Event(through_the_bottom, FINDER), dfx.SaveAt(ts=ts, t1=True)
     sol = dfx.diffeqsolve(
-        *(dps.HamiltonianTerm(system()), dps.BlanesMoanRKN6(), START[0], START[1]),
+        *(system(), dps.BlanesMoanRKN6(), START[0], START[1]),
         dt0=0.31,
         y0=START[2],
         event=event,

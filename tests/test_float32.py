@@ -85,7 +85,7 @@ def soft_kinetic(t, p, args):
 HALF, ONE, TWO, THREE = map(np.float64, (0.5, 1.0, 2.0, 3.0))
 DAMPING = dps.LogDamping(THREE, shift=ONE)
 SYSTEMS = {
-    "undamped": dps.SeparableHamiltonian(dps.QuadraticKinetic(TWO), harmonic),
+    "undamped": dps.MechanicalSystem(dps.QuadraticKinetic(TWO), harmonic),
     "constant": dps.ConformalHamiltonian(
         dps.QuadraticKinetic(jnp.array([1.0, 2.0])), harmonic, dps.ConstantDamping(HALF)
     ),
@@ -93,7 +93,7 @@ SYSTEMS = {
         dps.QuadraticKinetic(jnp.diag(jnp.array([1.0, 2.0]))), harmonic, DAMPING
     ),
     "mixed": dps.ConformalHamiltonian(
-        dps.QuadraticKinetic(TWO), harmonic, dps.MixedDamping(ONE, ONE, HALF)
+        dps.QuadraticKinetic(TWO), harmonic, [dps.LogDamping(ONE), dps.PowerDamping(ONE, HALF)]
     ),
     "callable": dps.ConformalHamiltonian(
         dps.QuadraticKinetic(TWO), harmonic, lambda t: jnp.sin(t)
@@ -105,20 +105,18 @@ SYSTEMS = {
         dps.RelativisticKinetic(ONE, TWO), harmonic, DAMPING
     ),
     "any T": dps.ConformalHamiltonian(soft_kinetic, harmonic, DAMPING),
-    "by hand": dps.VectorField(lambda t, p, args: p, lambda t, q, args: -q, DAMPING),
     "nonseparable": dps.ConformalHamiltonian(energy=mixed_energy, damping=DAMPING),
 }
 NEEDS = {
     "relativistic": ("frozen", "split", *ANY),
     "any T": ("frozen", "split", *ANY),
-    "by hand": ("frozen", "split", *ANY),
     "nonseparable": ANY,
 }
 
 
 def step_dtypes(hamiltonian, solver, y, time=jnp.float32):
     """The dtypes of all outputs of a step, without compiling it."""
-    term = dps.HamiltonianTerm(hamiltonian)
+    term = hamiltonian
     t = jax.ShapeDtypeStruct((), time)
 
     def step(t0, t1, y):
@@ -175,7 +173,7 @@ MIXED = {
     "double": jnp.array([[1.0], [2.0]], jnp.float64),
 }
 MIXED_SYSTEMS = {
-    "undamped": dps.SeparableHamiltonian(dps.QuadraticKinetic(TWO), cosine),
+    "undamped": dps.MechanicalSystem(dps.QuadraticKinetic(TWO), cosine),
     "constant": dps.ConformalHamiltonian(
         dps.QuadraticKinetic(TWO), cosine, dps.ConstantDamping(HALF)
     ),

@@ -78,15 +78,15 @@ def constant(t):
 
 HAMILTONIANS = {
     "separable, quadratic T": (
-        dps.SeparableHamiltonian(QUADRATIC, potential),
+        dps.MechanicalSystem(QUADRATIC, potential),
         lambda t, q, P: quadratic(P) + potential(t, q, ARGS),
     ),
     "separable, relativistic T": (
-        dps.SeparableHamiltonian(RELATIVISTIC, potential),
+        dps.MechanicalSystem(RELATIVISTIC, potential),
         lambda t, q, P: relativistic(P) + potential(t, q, ARGS),
     ),
     "separable, any T": (
-        dps.SeparableHamiltonian(kinetic, potential),
+        dps.MechanicalSystem(kinetic, potential),
         lambda t, q, P: kinetic(t, P, ARGS) + potential(t, q, ARGS),
     ),
     "nonseparable": (
@@ -176,7 +176,7 @@ def test_vector_field_is_hamilton_s_equations(hamiltonian, H):
     dq, dP = jax.grad(H, 2)(T, Q, canonical), -jax.grad(H, 1)(T, Q, canonical)
     # Including the time dependence of the momentum transformation.
     _, dp = jax.jvp(hamiltonian.from_canonical, (T, canonical), (jnp.ones_like(T), dP))
-    field = dps.HamiltonianTerm(hamiltonian).vf(T, (Q, P), ARGS)
+    field = hamiltonian.vf(T, (Q, P), ARGS)
     assert_close(field, (dq, dp), 1e-13)
 
 
@@ -194,42 +194,6 @@ def test_equal_damping_is_conformal():
 
 
 # User-defined derivatives.
-
-
-def test_velocity_and_force_by_hand_are_used_and_equal_autodiff():
-    velocity = lambda t, p, args: args * p**3 + jnp.cos(t) * p[::-1]
-    force = lambda t, q, args: (
-        -args
-        * (1 + jnp.sin(t) / 4)
-        * (q + jnp.array([2 * q[0] * q[1], q[0] ** 2 - q[1] ** 2]))
-    )
-    expected = dps.ConformalHamiltonian(kinetic, potential, LOG)
-    by_hand = [
-        dps.ConformalHamiltonian(
-            kinetic, potential, LOG, velocity=velocity, force=force
-        ),
-        dps.VectorField(velocity, force, LOG),
-    ]
-    automatic = dps.HamiltonianTerm(expected).vf(T, (Q, P), ARGS)
-    for hamiltonian in by_hand:
-        field = dps.HamiltonianTerm(hamiltonian).vf(T, (Q, P), ARGS)
-        assert_close(field, automatic, 1e-14)
-    zero = lambda *_: 0.0
-    silent = dps.SeparableHamiltonian(kinetic, potential, velocity=zero, force=zero)
-    assert not np.any(flat(dps.HamiltonianTerm(silent).vf(T, (Q, P), ARGS)))
-
-
-def test_nonseparable_velocity_and_force_by_hand():
-    factor = lambda t, args: args * (1 + jnp.sin(t) / 4)
-    by_hand = dps.Hamiltonian(
-        energy,
-        velocity=lambda t, q, p, args: factor(t, args) * (1 + q @ q) * p,
-        force=lambda t, q, p, args: -factor(t, args) * (1 + p @ p) * q,
-    )
-    automatic = dps.Hamiltonian(energy)
-    for name in ("velocity", "force"):
-        one, two = (getattr(h, name)(T, Q, P, ARGS) for h in (by_hand, automatic))
-        assert_close(one, two, 1e-15)
 
 
 # Masses of all forms.
@@ -287,7 +251,7 @@ def test_the_relativistic_particle_stays_below_the_speed_of_light():
         np.testing.assert_allclose(speed, expected, 1e-14)
 
 
-ANY = dps.SeparableHamiltonian(kinetic, potential).kinetic
+ANY = dps.MechanicalSystem(kinetic, potential).kinetic
 
 
 @pytest.mark.parametrize(
@@ -312,7 +276,7 @@ def test_a_long_damped_frame_does_not_overflow():
     args = ARGS.astype(jnp.float32)
     for kinetic in (QUADRATIC, RELATIVISTIC):
         system = dps.DissipativeHamiltonian(kinetic, potential, CONSTANT, CONSTANT)
-        field = dps.HamiltonianTerm(system).vf(late, (q, p), args)
+        field = system.vf(late, (q, p), args)
         assert np.all(np.isfinite(flat(field)))
 
 
@@ -324,21 +288,8 @@ LAWS = {
     "negative": (dps.ConstantDamping(-0.7), lambda t: Decimal("-0.7") * t),
     "logarithmic": (dps.LogDamping(3.0), lambda t: 3 * t.ln()),
     "shifted": (LOG, lambda t: 3 * (t + Decimal("0.5")).ln()),
-    "mixed": (
-        dps.MixedDamping(2.0, 0.75, 0.25),
-        lambda t: 2 * t.ln() + Decimal("0.75") * t ** Decimal("0.25"),
-    ),
 }
 laws = pytest.mark.parametrize("law, eta", LAWS.values(), ids=LAWS)
-
-
-@laws
-def test_damping_law(law, eta):
-    np.testing.assert_allclose(law(T), float(eta(Decimal(float(T)))), 1e-14)
-    rate = jax.grad(law)(T)
-    np.testing.assert_allclose(law.rate(T), rate, 1e-14)
-    h = jnp.array(1e-5)
-    np.testing.assert_allclose(law.increment(T - h, 2 * h) / (2 * h), rate, 1e-8)
 
 
 @laws
@@ -358,43 +309,9 @@ def test_increments_are_exact_at_late_times(law, eta, h, dtype, tolerance):
     np.testing.assert_allclose(increment, expected, tolerance)
 
 
-@pytest.mark.parametrize("law", [law for law, _ in LAWS.values()], ids=LAWS)
-@pytest.mark.parametrize("h", [0.1, -0.1, 1e-6])
-def test_integrals_of_the_decay(law, h):
-    decay = lambda s: np.exp(-float(law.increment(T, jnp.array(s))))
-    expected, _ = scipy.integrate.quad(decay, 0, h, epsabs=0, epsrel=1e-13)
-    np.testing.assert_allclose(law.integral(T, jnp.array(h), order=8), expected, 1e-11)
-
-
-@pytest.mark.parametrize(
-    "law",
-    [
-        dps.ConstantDamping,
-        dps.LogDamping,
-        lambda gamma: dps.MixedDamping(gamma, gamma, 0.5),
-        lambda gamma: dps.MixedDamping(gamma, 0.3, gamma),
-    ],
-    ids=["constant", "logarithmic", "mixed", "mixed, power"],
-)
-def test_gradients_in_the_limit_of_no_damping(law):
-    h = jnp.array(0.1)
-
-    def values(gamma):
-        damping = law(gamma)
-        return jnp.stack(
-            [damping.increment(T, h), damping.rate(T), damping.integral(T, h, order=8)]
-        )
-
-    gradient = jax.jacrev(values)(jnp.array(0.0))
-    by_differences = (values(jnp.array(1e-5)) - values(jnp.array(-1e-5))) / 2e-5
-    np.testing.assert_allclose(gradient, by_differences, rtol=1e-8, atol=1e-9)
-
-
 def test_no_damping_is_the_limit_of_little_damping():
     y = (Q, P)
-    field = lambda damping: dps.HamiltonianTerm(
-        dps.ConformalHamiltonian(QUADRATIC, potential, damping)
-    ).vf(T, y, ARGS)
+    field = lambda damping: dps.ConformalHamiltonian(QUADRATIC, potential, damping).vf(T, y, ARGS)
     for law in (dps.ConstantDamping, dps.LogDamping):
         assert_close(field(law(0.0)), field(None), 1e-16)
         assert_close(field(law(1e-10)), field(None), 1e-9)
@@ -439,8 +356,8 @@ def test_massless_test_particles_have_a_way():
         pairs = masses[None, :, None] * (1 - jnp.eye(2))[..., None]
         return -jnp.sum(pairs * apart / cubes, axis=1)
 
-    system = dps.SeparableHamiltonian(
-        dps.QuadraticKinetic(), lambda t, q, args: jnp.nan, force=acceleration
+    system = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), dps.ForceField(acceleration)
     )
     q0 = jnp.array([[0.0, 0.0], [1.0, 0.0]])
     v0 = jnp.array([[0.0, 0.0], [0.0, 1.0]])
@@ -477,7 +394,7 @@ def test_pairwise_potential():
     unit = dps.pairwise_potential(fn)
     distances = jnp.linalg.norm(q[i] - q[j], axis=1)
     assert_close(unit(*args), jnp.sum(fn(0.3, distances, 2.0)), 1e-14)
-    hamiltonian = dps.SeparableHamiltonian(dps.QuadraticKinetic(), potential)
+    hamiltonian = dps.MechanicalSystem(dps.QuadraticKinetic(), potential)
     assert jnp.all(jnp.isfinite(hamiltonian.force(*args[:2], q, args[2])))
     with pytest.raises(ValueError, match=r"fn\(t, r, args\)"):
         dps.pairwise_potential(3.0)  # pyright: ignore[reportArgumentType]

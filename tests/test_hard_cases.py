@@ -20,7 +20,7 @@ NONFINITE = getattr(dfx.RESULTS, "nonfinite", dfx.RESULTS.nonlinear_divergence)
 
 
 def conservative(potential, mass=None):
-    return dps.SeparableHamiltonian(dps.QuadraticKinetic(mass), potential)
+    return dps.MechanicalSystem(dps.QuadraticKinetic(mass), potential)
 
 
 def damped(potential, damping):
@@ -51,7 +51,7 @@ def test_excitation_grows_until_overflow_is_physical():
     ends = []
     for t1 in (100.0, 250.0):
         t0, t1, dt0 = (jnp.float32(t) for t in (0.0, t1, 0.05))
-        ends.append(solve(system, dps.Checked(LEAPFROG), t0, t1, dt0, y0, throw=False))
+        ends.append(solve(system, LEAPFROG, t0, t1, dt0, y0, throw=False))
     # exp(50) is finite in float32, and exp(125) is not.
     assert ends[0].result == dfx.RESULTS.successful
     assert ends[1].result == NONFINITE
@@ -67,7 +67,7 @@ def test_no_drift_in_1e5_steps():
     # The step is a power of two, so times are exact. The error is bounded by that of
     # the scheme throughout; rounding errors are far smaller.
     system = conservative(harmonic)
-    term = dps.HamiltonianTerm(system)
+    term = system
     saveat = dfx.SaveAt(steps=True)
     solver = dps.Substeps(LEAPFROG, 50)
     sol = solve(system, solver, 0.0, 12500.0, 6.25, REST, saveat=saveat)
@@ -91,7 +91,7 @@ def test_ensemble_of_chaos():
     p0 = jax.random.normal(jax.random.fold_in(key, 1), (100, 2))
     left = 1 / 8 - jax.vmap(lambda q: henon_heiles(0.0, q, None))(q0)
     p0 *= jnp.sqrt(2 * left / jnp.sum(p0**2, axis=1))[:, None]
-    term = dps.HamiltonianTerm(conservative(henon_heiles))
+    term = conservative(henon_heiles)
 
     @eqx.filter_jit
     def means(solver, dt0):
@@ -134,8 +134,8 @@ def test_singular_damping_from_its_start(solver, error, t0):
 def test_stages_before_the_start_are_reported():
     system = damped(harmonic, dps.LogDamping(3.0))
     run = lambda solver: solve(system, solver, 1e-6, 1.0, 0.01, REST, throw=False)
-    assert run(dps.Checked(dps.PresymplecticYoshida4())).result == NONFINITE
-    assert run(dps.Checked(dps.Suzuki4())).result == dfx.RESULTS.successful
+    assert run(dps.PresymplecticYoshida4()).result == NONFINITE
+    assert run(dps.Suzuki4()).result == dfx.RESULTS.successful
 
 
 def test_kink():
@@ -167,7 +167,7 @@ def test_damping_by_pieces():
     for steps, low, high in ((49, 0.0, 1e-7), (50, 1e-7, 1e-3)):
         times = jnp.linspace(0.0, 3.0, steps)
         sol = dfx.diffeqsolve(
-            dps.HamiltonianTerm(system),
+            system,
             RKN4,
             0.0,
             3.0,
@@ -218,7 +218,7 @@ def test_a_diverging_root_finder_is_reported():
 
 
 def test_checked_with_its_wrappers():
-    solver = dps.Checked(dps.Substeps(dps.Compensated(LEAPFROG), 4))
+    solver = dps.Substeps(dps.Compensated(LEAPFROG), 4)
     y0 = (jnp.array([0.3]), jnp.array([-2.0]))
     sol = solve(conservative(broken), solver, 0.0, 8.0, 0.5, y0, throw=False)
     assert sol.result == NONFINITE

@@ -66,7 +66,7 @@ def test_limits_of_stability(name, gamma):
     hamiltonian = dps.ConformalHamiltonian(
         dps.QuadraticKinetic(), phase.potential, dps.ConstantDamping(gamma)
     )
-    term = dps.HamiltonianTerm(hamiltonian)
+    term = hamiltonian
     radii = []
     for h in (0.9 * limit, 1.01 * limit):
         t0, t1 = jnp.asarray(0.0), jnp.asarray(h)
@@ -98,7 +98,7 @@ def test_nesterov_by_hand():
 
     def by_package(solver):
         sol = dfx.diffeqsolve(
-            dps.HamiltonianTerm(hamiltonian),
+            hamiltonian,
             solver,
             t0=0.0,
             t1=20 * h,

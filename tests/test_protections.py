@@ -33,7 +33,7 @@ def test_compensated_is_the_same_scheme(base):
     assert_close(kept[0], plain[0], 1e-15)
     for name in ("k0", "k1"):
         assert_close(kept[2][name], plain[2][name], 1e-14)
-    term = dps.HamiltonianTerm(HENON)
+    term = HENON
     defect = dps.diagnostics.structure_defect(term, dps.Compensated(base), 0.5, 0.6, Y0)
     assert defect < 1e-14
 
@@ -62,12 +62,12 @@ def test_compensated_error_grows_less():
     rms = {}
     exact = None
     for name, dtype, solver in (
-        ("exact", jnp.float64, dps.Substeps(BASES[1], 50)),
-        ("plain", jnp.float32, dps.Substeps(BASES[1], 50)),
-        ("kept", jnp.float32, dps.Compensated(dps.Substeps(BASES[1], 50), 6.25)),
+        ("exact", jnp.float64, dps.Substeps(BASES[1], 64)),
+        ("plain", jnp.float32, dps.Substeps(BASES[1], 64)),
+        ("kept", jnp.float32, dps.Compensated(dps.Substeps(BASES[1], 64))),
     ):
         q = q0.astype(jnp.float32).astype(dtype)
-        t0, t1, dt0 = (jnp.asarray(t, dtype) for t in (0.0, 3750.0, 6.25))
+        t0, t1, dt0 = (jnp.asarray(t, dtype) for t in (0.0, 3744.0, 8.0))
         sol = solve(hamiltonian, solver, t0, t1, dt0, (q, jnp.zeros_like(q)))
         assert sol.ys is not None
         end = np.asarray(jnp.stack(sol.ys), np.float64)
@@ -88,23 +88,8 @@ def test_compensated_goes_on_from_its_state():
     assert_close(rest.ys, whole.ys, 1e-16)
 
 
-@pytest.mark.parametrize("sign", [1, -1])
-def test_nominal_length_in_float32(sign):
-    # At t = 1e4 the difference of two times is wrong by percents; the length is not.
-    t0, h = jnp.float32(sign * 1e4), jnp.float32(0.01)
-    t1 = t0 + sign * h
-    assert abs(abs(t1 - t0) / h - 1) > 0.02
-    y0 = (jnp.float32(1.0), jnp.float32(0.5))
-    free = dps.SeparableHamiltonian(dps.QuadraticKinetic(), lambda t, q, args: 0 * q)
-    kept, *_ = step(free, dps.Compensated(BASES[1], h), t0, t1, y0)
-    assert_close(kept[0], jnp.float32(1 + sign * 0.005), 1e-7)
-    # A shortened step keeps its actual length.
-    kept, *_ = step(free, dps.Compensated(BASES[1], 2 * h), t0, t1, y0)
-    assert_close(kept[0] - 1, (t1 - t0) / 2, 1e-7)
-
-
 def test_substeps_divide_the_jitter_of_the_clock():
-    free = dps.SeparableHamiltonian(dps.QuadraticKinetic(), lambda t, q, args: 0 * q)
+    free = dps.MechanicalSystem(dps.QuadraticKinetic(), lambda t, q, args: 0 * q)
     y0 = (jnp.float32(0.0), jnp.float32(1.0))
     t0, dt0 = jnp.float32(1e4), jnp.float32(0.01)
     for n, error in ((1, (0.02, 0.1)), (100, (0.0, 1e-3))):
@@ -117,7 +102,7 @@ def test_compensated_gradients():
     @jax.jit
     def end(x):
         sol = dfx.diffeqsolve(
-            dps.HamiltonianTerm(HENON),
+            HENON,
             dps.Compensated(dps.BlanesMoanRKN4()),
             0.0,
             1.0,
@@ -141,39 +126,17 @@ def cubic(t, q, args):
     return -args * jnp.sum(q**4)
 
 
-@pytest.mark.parametrize("base", BASES[1:3])
-@pytest.mark.parametrize("potential, args", [(explodes, 0.5), (cubic, 1e3)])
-def test_checked_reports(base, potential, args):
-    hamiltonian = dps.SeparableHamiltonian(dps.QuadraticKinetic(), potential)
-    y0 = (jnp.array([0.3]), jnp.array([3.0]))
-    run = lambda solver, **kwargs: solve(
-        hamiltonian, solver, 0.0, 10.0, 0.1, y0, jnp.asarray(args), **kwargs
-    )
-    sol = run(dps.Checked(base), throw=False)
-    assert sol.result == NONFINITE
-    assert sol.stats["num_steps"] < 100
-    unchecked = run(base)
-    assert unchecked.ys is not None
-    assert not np.all(np.isfinite(unchecked.ys[0]))
-
-
 def test_checked_raises_and_counts_the_first_failure():
-    hamiltonian = dps.SeparableHamiltonian(dps.QuadraticKinetic(), cubic)
+    hamiltonian = dps.MechanicalSystem(dps.QuadraticKinetic(), cubic)
     y0 = (jnp.array([0.3]), jnp.array([1.0]))
     with pytest.raises(eqx.EquinoxRuntimeError, match=r"Nonfinite|diverged"):
-        solve(hamiltonian, dps.Checked(BASES[1]), 0.0, 9.0, 0.1, y0, jnp.asarray(1e3))
+        solve(hamiltonian, BASES[1], 0.0, 9.0, 0.1, y0, jnp.asarray(1e3))
 
 
 def test_checked_is_the_same_scheme():
-    checked = step(HENON, dps.Checked(BASES[2]), 0.5, 0.6, Y0)
+    checked = step(HENON, BASES[2], 0.5, 0.6, Y0)
     plain = step(HENON, BASES[2], 0.5, 0.6, Y0)
     assert_close(checked[0], plain[0], 0)
     assert checked[4] == dfx.RESULTS.successful
 
 
-def test_errors():
-    for wrapper in (dps.Checked, dps.Compensated):
-        with pytest.raises(ValueError, match="must be a presymplectic solver"):
-            wrapper(dfx.Tsit5())  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="positive"):
-        dps.Compensated(BASES[1], -0.1)

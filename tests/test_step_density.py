@@ -26,9 +26,9 @@ def attraction(t, q, args):
 def kepler(gamma=None):
     kinetic = dps.QuadraticKinetic()
     if gamma is None:
-        return dps.HamiltonianTerm(dps.SeparableHamiltonian(kinetic, attraction))
+        return dps.MechanicalSystem(kinetic, attraction)
     damping = dps.ConstantDamping(gamma)
-    return dps.HamiltonianTerm(dps.ConformalHamiltonian(kinetic, attraction, damping))
+    return dps.ConformalHamiltonian(kinetic, attraction, damping)
 
 
 KEPLER = kepler()

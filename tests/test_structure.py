@@ -54,7 +54,7 @@ def swinging_energy(t, q, p, args):
 # Damping law, and its eta(t) in NumPy
 DAMPINGS = {
     "mixed": (
-        dps.MixedDamping(2.0, 0.5, 0.3),
+        [dps.LogDamping(2.0), dps.PowerDamping(0.5, 0.3)],
         lambda t: 2 * np.log(t) + 0.5 * t**0.3,
     ),
     "none": (None, lambda t: 0 * t),
@@ -98,7 +98,7 @@ def doubled_step(hamiltonian, solver, t0, t1, y, copy):
         field = hamiltonian.velocity(t0, q, p_copy), hamiltonian.force(t0, q, p_copy)
         carry = copy, field
     y, _, _, carry, _ = solver.step(
-        dps.HamiltonianTerm(hamiltonian), t0, t1, y, None, carry, False
+        hamiltonian, t0, t1, y, None, carry, False
     )
     # The first leaves are the copy, or the difference.
     return y, jtu.tree_leaves(carry)[:2]
@@ -175,7 +175,7 @@ def test_a_runge_kutta_method_does_not_contract_the_form():
 
 @eqx.filter_jit
 def there_and_back(hamiltonian, there, back, t0, t1, y):
-    term = dps.HamiltonianTerm(hamiltonian)
+    term = hamiltonian
     start = there.init(term, t0, t1, y, None)
     y, _, _, carry, _ = there.step(term, t0, t1, y, None, start, False)
     y, _, _, carry, _ = back.step(term, t1, t0, y, None, carry, False)

@@ -146,7 +146,9 @@ exceeds `tol`.
 
 def _check(solver, controller, event, passed_controller_state) -> None:
     what, instead = None, "`diffrax.RecursiveCheckpointAdjoint()`"
-    if not isinstance(solver, AbstractPresymplecticSolver):
+    # An instance of `HalfSolver` is one of the class of the solver in it.
+    known = isinstance(solver, AbstractPresymplecticSolver)
+    if not known or isinstance(solver, dfx.HalfSolver):
         what = f"`{type(solver).__name__}`, only solvers of this package"
     elif not isinstance(controller, dfx.ConstantStepSize | dfx.StepTo | StepsBetween):
         what = (

@@ -10,6 +10,10 @@ from .._scheme._engine import Span
 from .._system._bound import System
 
 
+# More than any solve takes, in integers of either precision.
+_MOST_STEPS = 2**30
+
+
 class StepsBetween(dfx.AbstractStepSizeController):
     """Equal steps between given times, each no longer than `dt0`.
 
@@ -93,7 +97,7 @@ class Steps(eqx.Module):
         self.starts = jnp.concatenate([t0[None], inner])
         spans = jnp.concatenate([inner, t1[None]]) - self.starts
         # As few equal steps as are not longer than `dt0`, but for rounding.
-        eps, most = float(jnp.finfo(t0.dtype).eps), jnp.iinfo(int).max // 2
+        eps, most = float(jnp.finfo(t0.dtype).eps), _MOST_STEPS
         numbers = jnp.ceil(spans / dt0 * (1 - 2 * eps))
         finite = jnp.isfinite(numbers)
         # A time that is not finite is never reached, with steps of the given length.

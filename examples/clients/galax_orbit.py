@@ -25,18 +25,18 @@ jax.config.update("jax_enable_x64", True)
 
 
 @AbstractOrbitField.terms.dispatch
-def terms(self: HamiltonianField, solver: dps.AbstractPresymplecticSolver, /):
+def terms(self: HamiltonianField, solver: dps.extend.AbstractPresymplecticSolver, /):
     def potential(t, q, args):
         return jnp.sum(self.potential._potential(q, t))  # of all orbits of a batch
 
     kinetic = dps.QuadraticKinetic()
-    return dps.HamiltonianTerm(dps.SeparableHamiltonian(kinetic, potential))
+    return dps.MechanicalSystem(kinetic, potential)
 
 
 solver = gd.OrbitSolver(
     dps.TunedRKN6(),
     stepsize_controller=dfx.ConstantStepSize(),
-    adjoint=dps.ReversibleAdjoint(),
+    adjoint=dps.FixedStepAdjoint(),
 )
 field = HamiltonianField(gp.MilkyWayPotential())
 w0 = gc.PhaseSpaceCoordinate(

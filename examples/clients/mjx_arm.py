@@ -62,18 +62,18 @@ def potential(t, q, args):
     return weight + jnp.sum(arm.jnt_stiffness * (q - arm.qpos_spring) ** 2) / 2
 
 
-system = dps.LagrangianSystem(mass_matrix, potential, friction=arm.dof_damping)
+system = dps.LagrangianSystem(mass_matrix, potential, friction=dps.ViscousDamping(arm.dof_damping))
 q0, ts = jnp.array([1.2, 0.4, -0.5]), jnp.linspace(0.0, 5.0, 101)
 start = time.perf_counter()
 sol = dfx.diffeqsolve(
-    dps.HamiltonianTerm(system),
+    system,
     dps.PresymplecticGauss(4),
     t0=0.0,
     t1=5.0,
     dt0=0.01,
     y0=(q0, jnp.zeros(3)),
     saveat=dfx.SaveAt(ts=ts),
-    adjoint=dps.ReversibleAdjoint(),
+    adjoint=dps.FixedStepAdjoint(),
 )
 jax.block_until_ready(sol.ys)
 print(f"compiled and run in {time.perf_counter() - start:.0f} s")

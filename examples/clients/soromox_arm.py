@@ -39,18 +39,19 @@ q0, v0 = jnp.array([1.0, 0.5, -0.3, 0.2]), jnp.zeros(n)
 system = dps.LagrangianSystem(
     mass_matrix=lambda t, q, args: robot.inertia_matrix(q),
     potential=lambda t, q, args: robot.potential_energy(q),
-    friction=robot.damping_matrix(q0),  # constant for this robot
+    # The coefficients are constant for this robot.
+    friction=dps.ViscousDamping(robot.damping_matrix(q0)),
 )
 ts = jnp.linspace(0.0, 5.0, 101)
 sol = dfx.diffeqsolve(
-    dps.HamiltonianTerm(system),
+    system,
     dps.PresymplecticGauss(6),
     t0=0.0,
     t1=5.0,
     dt0=0.01,
     y0=(q0, system.from_velocity(0.0, q0, v0)),
     saveat=dfx.SaveAt(ts=ts),
-    adjoint=dps.ReversibleAdjoint(),
+    adjoint=dps.FixedStepAdjoint(),
 )
 
 rollout = robot.rollout_to(

@@ -54,7 +54,25 @@ def report(name, fig, rows, options) -> None:
         page.write_text(text)
 
 
-class Nesterov(dps.AbstractPresymplecticSolver[None]):
+class NesterovMove(dps.extend.AbstractMove):
+    """After the kick of position-first Euler, the drift again with the new momentum."""
+
+    def prepare(self, system, span):
+        return system.prepare_decay(span.t0, span.h)
+
+    def apply(self, system, span, data, stage):
+        y, carry = stage
+        _, t1, h = span
+        y = q, p = system.decay(data, y)
+        ahead, _ = system.add(y, (h * system.velocity(t1, y), None))
+        _, p = system.add(y, (None, h * system.force(t1, (ahead, p))))
+        return (system.add((q, p), (h * system.velocity(t1, (q, p)), None)), carry), None
+
+    def undo(self, system, span, data, stage):
+        raise NotImplementedError
+
+
+class Nesterov(dps.extend.AbstractPresymplecticSolver):
     """Nesterov's method as a solver of order one, with mu = exp(eta(t) - eta(t + h)).
 
     It differs from position-first Euler in one respect: after the kick, the drift is
@@ -68,13 +86,8 @@ class Nesterov(dps.AbstractPresymplecticSolver[None]):
     def order(self, terms):
         return 1
 
-    def advance(self, system, t0, t1, h, y, carry):
-        q, p = y
-        h = h.astype(q.dtype)
-        p = system.move_frame(t0, h, p)
-        ahead = system.add(q, h, system.velocity(t1, (q, p)))
-        p = system.add(p, h, system.force(t1, (ahead, p)))
-        return (system.add(q, h, system.velocity(t1, (q, p))), p), None, None
+    def scheme(self, system):
+        return dps.extend.Scheme(NesterovMove(), is_invertible=False)
 
 
 def growth(ts, errors, first, last) -> float:

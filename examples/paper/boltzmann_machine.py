@@ -88,18 +88,17 @@ def force(t, q, data):
 
 
 def classical(t, p, data):
-    return jax.tree.map(lambda p: data.h * p, p)
+    return data.h * sum(jnp.sum(p**2) for p in jax.tree.leaves(p)) / 2
 
 
 def relativistic(t, p, data):
     """Equation (rel_ham), c = 5 and m = 1, for weights and biases separately."""
     c = 5.0
-
-    def velocity(p):
-        axes = tuple(range(1, p.ndim))
-        return data.h * c * p / jnp.sqrt(jnp.sum(p**2, axis=axes, keepdims=True) + c**2)
-
-    return jax.tree.map(velocity, p)
+    each = [
+        jnp.sqrt(jnp.sum(p**2, axis=tuple(range(1, p.ndim))) + c**2)
+        for p in jax.tree.leaves(p)
+    ]
+    return data.h * c * sum(map(jnp.sum, each))
 
 
 def loss(t, q, data):
@@ -110,9 +109,9 @@ def loss(t, q, data):
     return jnp.mean((batch - again) ** 2, axis=(1, 2))
 
 
-def presymplectic(velocity, mu):
+def presymplectic(kinetic, mu):
     damping = dps.ConstantDamping(-2 * np.log(mu))  # mu is the factor of half a step
-    return dps.HamiltonianTerm(dps.VectorField(velocity, force, damping))
+    return dps.MechanicalSystem(kinetic, dps.ForceField(force), damping)
 
 
 METHODS = {
@@ -134,7 +133,7 @@ METHODS = {
 def train(term, solver, q0, data, epochs, every):
     """The losses after each `every` epochs, and the trained machines."""
     y0 = q0
-    if isinstance(term, dps.HamiltonianTerm):
+    if isinstance(term, dps.MechanicalSystem):
         y0 = (q0, jax.tree.map(jnp.zeros_like, q0))
     position = lambda y: y[0] if isinstance(y, tuple) else y
     steps = epochs * data.batches.shape[1]

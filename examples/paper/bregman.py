@@ -27,7 +27,7 @@ def values(mirror_map, objective, scaling, solver, q0, t1, h):
     """Times from 1 to `t1` in steps of `h`, and f - f* at each."""
     hamiltonian = dps.BregmanHamiltonian(mirror_map, objective, scaling)
     sol = dfx.diffeqsolve(
-        dps.HamiltonianTerm(hamiltonian),
+        hamiltonian,
         solver,
         t0=1.0,
         t1=t1,

@@ -26,7 +26,7 @@ HIGH = dps.BlanesCasasRKN8()
 def solve(hamiltonian, solver, q0, t1, steps):
     """Times, states and values of the Hamiltonian at `steps` equal steps."""
     sol = dfx.diffeqsolve(
-        dps.HamiltonianTerm(hamiltonian),
+        hamiltonian,
         solver,
         t0=0.0,
         t1=t1,

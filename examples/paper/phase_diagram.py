@@ -121,7 +121,7 @@ def final_gradients(solver, gammas, hs, eigenvalues, q0, iterations=800):
             dps.QuadraticKinetic(), potential, dps.ConstantDamping(gamma), force=force
         )
         sol = dfx.diffeqsolve(
-            dps.HamiltonianTerm(hamiltonian),
+            hamiltonian,
             solver,
             t0=0.0,
             t1=iterations * h,

@@ -37,7 +37,7 @@ HAMILTONIAN = dps.ConformalHamiltonian(
 @eqx.filter_jit
 def gradient_norms(solver, h, eigenvalues, q0, iterations):
     sol = dfx.diffeqsolve(
-        dps.HamiltonianTerm(HAMILTONIAN),
+        HAMILTONIAN,
         solver,
         t0=0.0,
         t1=iterations * h,
