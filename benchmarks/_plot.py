@@ -19,14 +19,8 @@ GROUPS = ("o-", "s--", "^:")
 def panels(count, columns, size, **options):
     """A figure of `count` panels, each of a `size` in inches, and its axes."""
     rows = -(-count // columns)
-    fig, axes = plt.subplots(
-        rows,
-        columns,
-        figsize=(size[0] * columns, size[1] * rows),
-        layout="constrained",
-        squeeze=False,
-        **options,
-    )
+    options |= {"figsize": (size[0] * columns, size[1] * rows), "squeeze": False}
+    fig, axes = plt.subplots(rows, columns, layout="constrained", **options)
     for ax in axes.flat[:count]:
         ax.grid(alpha=0.3)
     for ax in axes.flat[count:]:

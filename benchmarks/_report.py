@@ -19,7 +19,10 @@ def command_line(doc):
 
 def means(rows):
     """The geometric mean and the least of each column, without those not reached."""
-    known = [[x for x in column if x and 0 < x < math.inf] for column in zip(*rows, strict=True)]
+    known = [
+        [x for x in column if x and 0 < x < math.inf]
+        for column in zip(*rows, strict=True)
+    ]
     mean = [statistics.geometric_mean(x) if x else None for x in known]
     return mean, [min(x, default=None) for x in known]
 

@@ -1,4 +1,4 @@
-"""The solves of the benchmarks, and the reference solution of all of them."""
+"""The solves of the benchmarks, in double precision, and the reference solution."""
 
 from typing import Any
 
@@ -11,6 +11,8 @@ from jax.flatten_util import ravel_pytree
 
 import diffrax_presym as dps
 
+
+jax.config.update("jax_enable_x64", True)
 
 LAST = dfx.SaveAt(t1=True)
 CONSTANT = dfx.ConstantStepSize()

@@ -126,4 +126,4 @@ def fastest(curves, target, group):
         for (kind, name), curve in curves.items()
         if kind == group
     )
-    return min(found, default=(math.inf, "-"))
+    return min((x for x in found if x[0] < math.inf), default=(math.inf, "-"))

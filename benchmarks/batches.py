@@ -8,18 +8,13 @@ members. A time is the median of interleaved runs, or one run if that takes seco
 Solves are omitted if the time for a smaller batch predicts that they take too long, and
 if they take more than a million steps.
 
-The other tables are batches of 1024: damped Henon-Heiles systems, whose force is a
-polynomial, and the pendulums with what else matters on a CPU: the sine, which XLA
-evaluates one by one in double precision, from `diffrax_presym.math`; and the batch cut
-into blocks, `jax.lax.map(solve, y0, batch_size=512)`, too small for XLA to spread each
-operation over threads, which costs more than it gains at this size. heyoka is
-measured if it is installed, as it is used for many trajectories: one after the other,
-and as many at a time as the processor has lanes. It runs on one core, where XLA may use
-all, so the second column is the time summed over all cores: also the steadier of the
-two on a machine with other work.
+The other tables are batches of 1024, of pendulums and of damped Henon-Heiles systems,
+whose force is a polynomial, beside heyoka if it is installed, as it is used for many
+trajectories: one after the other, and as many at a time as the processor has lanes. It
+runs on one core, where XLA may use all, so the second column is the time summed over
+all cores: also the steadier of the two on a machine with other work.
 """
 
-import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -35,14 +30,9 @@ from _solve import reference, states
 from _timing import interleaved, timed
 from outside import symbolic
 
-import diffrax_presym as dps
-
-
-jax.config.update("jax_enable_x64", True)
 
 SIZES = (1, 64, 4096, 262144)
 TARGETS = (1e-6, 1e-9)
-BLOCK = 512
 CHECKED = 4096
 MOST_STEPS = 1e6
 
@@ -53,15 +43,11 @@ class Method(NamedTuple):
     adaptive: bool = False
 
 
-OURS = [
-    Method(name, SCHEMES[name])
-    for name in (
-        "PresymplecticLeapfrog",
-        "BlanesMoanRKN4",
-        "BlanesMoanRKN6",
-        "BlanesCasasRKN8",
-    )
-]
+NAMES = (
+    *("PresymplecticLeapfrog", "BlanesMoanRKN4", "BlanesMoanRKN6"),
+    "BlanesCasasRKN8",
+)
+OURS = [Method(name, SCHEMES[name]) for name in NAMES]
 RIVALS = [
     Method(f"{name}, {kind}", DIFFRAX[name], kind == "adaptive")
     for name in ("Tsit5", "Dopri8")
@@ -69,13 +55,10 @@ RIVALS = [
 ]
 
 
-@dataclasses.dataclass(frozen=True)
-class Batch:
+class Batch(NamedTuple):
     problem: problems.Problem
     # The first `n` starting points, with an array for each coordinate.
     starts: Callable
-    # Other ways to write the Hamiltonian, by name.
-    variants: dict[str, dps.AbstractHamiltonian]
 
 
 def spread(n, *boxes):
@@ -91,40 +74,24 @@ def spread(n, *boxes):
 
 
 def pendulums():
-    problem = problems.pendulum()
-    polynomial = dps.ConformalHamiltonian(
-        dps.QuadraticKinetic(), lambda t, q, args: -jnp.sum(jnp.cos(q)), problem.damping
-    )
-    return Batch(
-        problem,
-        # The hardest first.
-        lambda n: tuple(spread(n, (2.5, 5.0), (0.0, 1.0))),
-        {"XLA's sine": problem.hamiltonian, "polynomial sine": polynomial},
-    )
+    # The hardest first.
+    starts = lambda n: tuple(spread(n, (2.5, 5.0), (0.0, 1.0)))
+    return Batch(problems.pendulum(), starts)
 
 
 def henon_heiles():
-    problem = problems.henon_heiles()
-
     def starts(n):
         x, y, px, py = spread(n, *[(0.25, 0.5)] * 4)
         return (x, y), (px, py)
 
-    return Batch(problem, starts, {"polynomial force": problem.hamiltonian})
+    return Batch(problems.henon_heiles(), starts)
 
 
-def batched(hamiltonian, t1, method, block=None):
+def batched(problem, method):
     """`solve(y0, x)`, with `x` the number of steps, or the tolerance."""
-    solver, options = method.scheme.solver, {}
-    if isinstance(solver, dps.extend.AbstractPresymplecticSolver):
-        options["adjoint"] = dps.FixedStepAdjoint()
-    one = lambda y0, x: states(
-        hamiltonian, solver, (0.0, t1), y0, x, adaptive=method.adaptive, **options
-    )
-    if block is None:
-        return jax.jit(jax.vmap(one, in_axes=(0, None)))
-    blocks = lambda y0, x: jax.lax.map(lambda y: one(y, x), y0, batch_size=block)
-    return jax.jit(blocks)
+    args = problem.system, method.scheme.solver, (0.0, problem.t1)
+    one = lambda y0, x: states(*args, y0, x, adaptive=method.adaptive)
+    return jax.jit(jax.vmap(one, in_axes=(0, None)))
 
 
 def rows(y):
@@ -139,7 +106,7 @@ class Errors:
     def __init__(self, batch, n):
         problem = batch.problem
         times = [0.0, problem.t1]
-        ys = reference(problem.hamiltonian, batch.starts(n), times, batch=True)
+        ys = reference(problem.system, batch.starts(n), times, batch=True)
         self.exact = rows(jax.tree.map(lambda y: y[:, 0], ys))
         self.largest = np.max(np.abs(self.exact))
 
@@ -181,7 +148,7 @@ def tune_all(batch, methods, errors):
     """The number of steps, or the tolerance, by method and target."""
     tuned = {}
     for method in methods:
-        solve = batched(batch.problem.hamiltonian, batch.problem.t1, method)
+        solve = batched(batch.problem, method)
         for target in TARGETS:
             x = tune(solve, method, target, errors, batch.starts(64))
             tuned[method.name, target] = solve, x
@@ -232,117 +199,79 @@ def heyoka_runs(batch, n, errors):
         return {}
     equations = symbolic(batch.problem, hy)
     y0 = rows(batch.starts(n))
-    lanes = hy.recommended_simd_size()
 
-    def serial(tolerance):
-        zeros = np.zeros(len(y0))
-        integrator = hy.taylor_adaptive(equations, zeros, tol=tolerance)
-
-        def solve():
-            out = np.empty_like(y0)
-            for i in range(n):
-                integrator.time = 0.0
-                integrator.state[:] = y0[:, i]
-                integrator.propagate_until(batch.problem.t1)
-                out[:, i] = integrator.state
-            return out
-
-        return solve
-
-    def in_lanes(tolerance):
-        zeros = np.zeros((len(y0), lanes))
-        integrator = hy.taylor_adaptive_batch(equations, zeros, tol=tolerance)
+    def make(tolerance, lanes):
+        zeros = np.zeros((len(y0), lanes) if lanes > 1 else len(y0))
+        kind = hy.taylor_adaptive_batch if lanes > 1 else hy.taylor_adaptive
+        integrator = kind(equations, zeros, tol=tolerance)
 
         def solve():
             out = np.empty_like(y0)
             for i in range(0, n, lanes):
-                integrator.set_time(0.0)
-                integrator.state[:] = y0[:, i : i + lanes]
+                if lanes > 1:
+                    integrator.set_time(0.0)
+                else:
+                    integrator.time = 0.0
+                part = slice(i, i + lanes) if lanes > 1 else i
+                integrator.state[:] = y0[:, part]
                 integrator.propagate_until(batch.problem.t1)
-                out[:, i : i + lanes] = integrator.state
+                out[:, part] = integrator.state
             return out
 
         return solve
 
-    runs = {}
-    for name, make in {
-        "heyoka, one by one": serial,
-        f"heyoka, {lanes} at a time": in_lanes,
-    }.items():
+    runs, several = {}, hy.recommended_simd_size()
+    for name, lanes in {"one by one": 1, f"{several} at a time": several}.items():
         for target in TARGETS:
             # More digits can take less time, so any that reaches the target will do.
-            tolerances = [target * 10 ** (-k / 2) for k in range(7)]
-            solves = [make(tolerance) for tolerance in tolerances]
+            solves = [make(target * 10 ** (-k / 2), lanes) for k in range(7)]
             reach = [s for s in solves if errors.of(s()) <= target]
-            runs[name, target] = min(reach, key=lambda s: timed(s)[1])
+            best = min(reach, key=lambda s: timed(s)[1])
+            runs["heyoka", f"heyoka, {name}", target] = best
     return runs
 
 
 def compare_with_heyoka(batch, methods, n, repeats):
     errors = Errors(batch, n)
-    tuned = tune_all(batch, methods, errors)
-    y0 = batch.starts(n)
-    calls: dict[tuple[str, float], Callable] = {}
-    for variant, hamiltonian in batch.variants.items():
-        for block in (None, BLOCK) if n > BLOCK else (None,):
-            how = f"{variant}, {'vmap' if block is None else f'blocks of {block}'}"
-            for method in methods:
-                solve = batched(hamiltonian, batch.problem.t1, method, block)
-                for target in TARGETS:
-                    _, x = tuned[method.name, target]
-                    if x is not None:
-                        key = f"{method.name:17}{how}", target
-                        calls[key] = program(solve, y0, x)
+    calls: dict[tuple[str, str, float], Callable] = {}
+    for (name, target), (solve, x) in tune_all(batch, methods, errors).items():
+        group = "ours" if name in NAMES else "Diffrax"
+        if x is not None:
+            calls[group, name, target] = program(solve, batch.starts(n), x)
     calls |= heyoka_runs(batch, n, errors)
     found = interleaved(calls, repeats)
     table = Table(
         f"{batch.problem.name}, a batch of {n}: microseconds per trajectory, "
         "summed over all cores, and error",
-        ":<47",
-        *(f"error {target:.0e}:>21" for target in TARGETS),
+        *(":<22", *(f"error {target:.0e}:>21" for target in TARGETS)),
     )
-    for name in dict.fromkeys(name for name, _ in calls):
-        row = []
-        for target in TARGETS:
-            timing = found.get((name, target))
-            if timing is not None:
+    for name in dict.fromkeys(name for _, name, _ in calls):
+        cells = dict.fromkeys(TARGETS)
+        for (_, other, target), timing in found.items():
+            if other == name:
                 us, cores = (s / n * 1e6 for s in (timing.median, timing.median_cpu))
                 error = errors.of(timing.result)
-                row.append(f"{us:.1f} {cores:>7.1f} {error:.0e}")
-            else:
-                row.append(None)
-        table.row(name, *row)
-    rivals = {"Diffrax": names(RIVALS)}
-    rivals |= {name: name for name, _ in calls if name.startswith("heyoka")}
+                cells[target] = f"{us:.1f} {cores:>7.1f} {error:.0e}"
+        table.row(name, *cells.values())
+    rivals = list(dict.fromkeys(group for group, *_ in calls if group != "ours"))
     table = Table(
         "The best of each over our best: in time (in time summed over all cores)",
-        ":<26",
-        *(f"{rival}:>21" for rival in rivals),
+        *(":<8", *(f"{rival}:>21" for rival in rivals)),
     )
+
+    def best(group, target, clock):
+        keys = (key for key in found if (key[0], key[2]) == (group, target))
+        return min(getattr(found[key], clock) for key in keys)
+
     for target in TARGETS:
-        for variant in batch.variants:
-            row = []
-            for rival, start in rivals.items():
-                share = variant if rival == "Diffrax" else ""
-                time, cores = (
-                    best(found, target, start, share, clock)
-                    / best(found, target, names(OURS), variant, clock)
-                    for clock in ("median", "median_cpu")
-                )
-                row.append(f"{time:.1f} ({cores:.1f})")
-            table.row(f"  {target:.0e}, {variant}", *row)
-
-
-def names(methods):
-    return tuple(method.name for method in methods)
-
-
-def best(found, target, start, contains, clock):
-    return min(
-        getattr(timing, clock)
-        for (name, t), timing in found.items()
-        if t == target and name.startswith(start) and contains in name
-    )
+        cells = []
+        for rival in rivals:
+            both = [
+                best(rival, target, clock) / best("ours", target, clock)
+                for clock in ("median", "median_cpu")
+            ]
+            cells.append(f"{both[0]:.1f} ({both[1]:.1f})")
+        table.row(f"  {target:.0e}", *cells)
 
 
 def main():

@@ -1,4 +1,4 @@
-"""`choose_step` on the problems of both halves: the error asked for, predicted, and got.
+"""`choose_step` on the problems of both halves: errors asked for, predicted, and got.
 
 The error is that of `choose_step`, with `atol = rtol`: the largest of an entry over
 `rtol (1 + |y|)`. It is found against `reference`, of the state at the final time, and
@@ -20,8 +20,6 @@ from problems_tuning import PROBLEMS as TUNING
 
 import diffrax_presym as dps
 
-
-jax.config.update("jax_enable_x64", True)
 
 TOLERANCES = (1e-3, 1e-6, 1e-9)
 SAVED = 40

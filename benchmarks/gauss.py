@@ -11,6 +11,7 @@ and their mass matrices. `--long` follows the energy of an undamped double pendu
 a million steps, of several lengths.
 """
 
+import importlib
 from functools import partial
 from typing import Any
 
@@ -19,16 +20,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _mujoco import mujoco_mass, mujoco_tables
 from _report import command_line, means, Table
 from _schemes import DIFFRAX
 from _solve import reference_end, relative_error, solve, states
-from _timing import error_curves, fastest, time_to
+from _timing import error_curves, fastest, interleaved, time_to
 
 import diffrax_presym as dps
 
-
-jax.config.update("jax_enable_x64", True)
 
 TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
 TOLERANCES = 10.0 ** -np.arange(2, 14)
@@ -268,18 +266,55 @@ def rods(n):
 
 
 def mujoco(quick):
-    problems = {}
+    """Errors and times of MuJoCo's integrators, and of ours on the same equations.
+
+    MuJoCo loads a model once; a time is that of its steps.
+    """
+    try:
+        mj: Any = importlib.import_module("mujoco")
+    except ImportError:
+        print("MuJoCo is not installed: pip install mujoco")
+        return
+    solvers = {f"Gauss({s})": dps.PresymplecticGauss(s) for s in (3, 6)}
+    solvers["Gauss(4), 1e-8"] = dps.PresymplecticGauss(4, tolerance=1e-8)
     for n, t1 in ((3, 10.0), (10, 5.0)):
-        y0 = jnp.linspace(1.0 if n == 3 else 0.3, 0.1, n), jnp.zeros(n)
-        problems[f"chain of {n} hinges"] = hinges(n), rods(n), y0, t1
-        theirs = mujoco_mass(hinges(n), y0[0])
-        if theirs is not None:
-            ours = rods(n).mass_matrix(0.0, y0[0])
-            difference = np.max(np.abs(ours - theirs)) / np.max(np.abs(theirs))
-            print(f"Mass matrix of {n} hinges, relative difference: {difference:.1e}")
-    gauss = {f"Gauss({s})": dps.PresymplecticGauss(s) for s in (3, 6)}
-    gauss["Gauss(4), 1e-8"] = dps.PresymplecticGauss(4, tolerance=1e-8)
-    mujoco_tables(problems, gauss, quick)
+        model, system = mj.MjModel.from_xml_string(hinges(n)), rods(n)
+        q0 = jnp.linspace(1.0 if n == 3 else 0.3, 0.1, n)
+
+        def simulate(integrator, steps, model=model, q0=q0, t1=t1):
+            model.opt.integrator = getattr(mj.mjtIntegrator, f"mjINT_{integrator}")
+            model.opt.timestep, data = t1 / steps, mj.MjData(model)
+            data.qpos[:] = q0
+            mj.mj_step(model, data, nstep=steps)
+            return data.qpos.copy(), data.qvel.copy()
+
+        data, mass = mj.MjData(model), np.zeros((n, n))
+        data.qpos[:] = q0
+        mj.mj_forward(model, data)
+        for column, unit in zip(mass, np.eye(n), strict=True):
+            mj.mj_mulM(model, data, column, unit)
+        difference = relative_error(system.mass_matrix(0.0, q0), mass)
+        print(f"\nMass matrix of {n} hinges, relative difference: {difference:.1e}")
+        exact = simulate("RK4", 40_000 if quick else 200_000)
+        calls = {
+            (f"MuJoCo {name}", steps): partial(simulate, name.upper(), steps)
+            for name in ("Euler", "implicitfast", "RK4")
+            for steps in (1000, 4000, 16000)
+        }
+        for name, solver in solvers.items():
+            one = eqx.filter_jit(partial(states, system, solver, (0.0, t1)))
+            for steps in (50, 200, 800):
+                y0 = q0, jnp.zeros(n)
+                calls[name, steps] = partial(one, y0, jnp.asarray(float(steps)))
+        table = Table(
+            f"A chain of {n} hinges, to t = {t1}",
+            *("integrator:<24", "steps:>7d", "error:>9.1e", "milliseconds:>13.3f"),
+        )
+        for (name, steps), timing in interleaved(calls, 3 if quick else 9).items():
+            y = timing.result
+            if not name.startswith("MuJoCo"):
+                y = system.to_velocity(0.0, y)
+            table.row(name, steps, relative_error(y, exact), 1e3 * timing.median)
 
 
 def main():

@@ -27,8 +27,6 @@ from _timing import error_curves, time_to
 import diffrax_presym as dps
 
 
-jax.config.update("jax_enable_x64", True)
-
 NEWTON = optx.Newton(rtol=1e-12, atol=1e-12)
 SIZE = 20
 
@@ -70,8 +68,7 @@ def least_squares(t, q, args):
 def data():
     random = np.random.default_rng(0)
     A = random.normal(size=(2 * SIZE, SIZE)) / np.sqrt(2 * SIZE)
-    solution = random.dirichlet(np.ones(SIZE))
-    return jnp.array(A), jnp.array(A @ solution)
+    return jnp.array(A), jnp.array(A @ random.dirichlet(np.ones(SIZE)))
 
 
 MIXED = dps.Hamiltonian(mixed_energy)
@@ -80,20 +77,19 @@ START = (jnp.array(-3.0), jnp.array(0.0))
 
 
 def bregman(mirror_map):
-    return dps.BregmanHamiltonian(
-        mirror_map, least_squares, dps.PolynomialScaling(2.0, 0.25)
-    )
+    scaling = dps.PolynomialScaling(2.0, 0.25)
+    system = dps.BregmanHamiltonian(mirror_map, least_squares, scaling)
+    return system, (jnp.full(SIZE, 1 / SIZE), jnp.zeros(SIZE)), data(), (1.0, 21.0)
 
 
 # System, initial state, arguments, time, schemes that apply, longest stage
-UNIFORM = (jnp.full(SIZE, 1 / SIZE), jnp.zeros(SIZE))
 PROBLEMS = {
     "Bregman, quadratic": (
-        *(bregman(dps.EuclideanMirror()), UNIFORM, data(), (1.0, 21.0)),
+        *bregman(dps.EuclideanMirror()),
         *(SPLIT | QUADRATIC | ANY, 0.5),
     ),
     "Bregman, entropic": (
-        *(bregman(dps.EntropyMirror(simplex=True)), UNIFORM, data(), (1.0, 21.0)),
+        *bregman(dps.EntropyMirror(simplex=True)),
         *(SPLIT | ANY, 0.5),
     ),
     "(q² + 1)(p² + 1)/2": (MIXED, START, None, (0.0, 20.0), ANY, 0.05),
@@ -106,9 +102,8 @@ def speed(quick, repeats):
     for problem, (H, y0, args, (t0, t1), schemes, longest) in PROBLEMS.items():
         exact, runs = reference_end(H, y0, t0, t1, args), {}
         for name, (solver, _, cost) in schemes.items():
-            run = lambda n, system=H, solver=solver, times=(t0, t1), y0=y0, args=args: (
-                states(system, solver, times, y0, n, args)
-            )
+            problem = H, solver, (t0, t1), y0
+            run = lambda n, problem=problem, args=args: states(*problem, n, args)
             least = 4 * max(1, (t1 - t0) / longest / cost)
             most = math.log2((3e3 if quick else 6e4) / cost / least)
             n = [round(least * 2 ** (k / 2)) for k in range(math.ceil(2 * most))]

@@ -1,12 +1,6 @@
 """Integrators from outside JAX, where they are installed: `{name: (solve, sweep)}`."""
 
-import math
-
 import numpy as np
-
-
-# Pure Python, so no more steps than this.
-STEPS = tuple(100 * 2**k for k in range(6))
 
 
 def scipy_runs(problem, tolerances):
@@ -28,74 +22,6 @@ def scipy_runs(problem, tolerances):
         return sol.y[:, -1].reshape(2, n)
 
     return {"scipy DOP853": (solve, list(tolerances))}
-
-
-def pyhamsys_runs(problem, steps):
-    """pyhamsys' compositions of a user's flows: drift, friction and kick."""
-    try:
-        import pyhamsys  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        return {}
-    if len(problem.q0) > 100:
-        return {}
-    zero = np.zeros_like(problem.q0)
-    velocity = lambda t, p: problem.rhs(t, problem.q0, p)[0]
-    force = lambda t, q: problem.rhs(t, q, zero)[1]
-
-    # In pyhamsys `t` is the end of the step of `chi`, and the start of its adjoint's.
-    def chi(h, t, y):
-        q, p = y
-        q = q + h * velocity(t, p)
-        p = math.exp(-problem.increment(t - h, h)) * p
-        return np.array([q, p + h * force(t, q)])
-
-    def adjoint(h, t, y):
-        q, p = y
-        p = p + h * force(t, q)
-        p = math.exp(-problem.increment(t, h)) * p
-        return np.array([q + h * velocity(t, p), p])
-
-    def solve(n, name):
-        step = problem.t1 / n
-        parameters = pyhamsys.Parameters(step=step, solver=name, display=False)
-        ends = 0.0, problem.t1
-        y0 = np.array([problem.q0, problem.p0])
-        sol = pyhamsys.solve_ivp_symp(
-            chi, adjoint, ends, y0, np.array(ends), parameters
-        )
-        return sol.y[..., -1]
-
-    return {
-        f"pyhamsys {name}": (lambda n, name=name: solve(n, name), list(steps))
-        for name in ("BM4", "BM6")
-    }
-
-
-def symplecta_runs(problem, steps):
-    """symplecta's implicit midpoint rule, on the canonical equations."""
-    try:
-        import symplecta  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        return {}
-    if len(problem.q0) > 2:
-        return {}
-    zero = np.zeros_like(problem.q0)
-    scale = lambda t: math.exp(problem.increment(0.0, t))
-
-    def solve(n):
-        sol = symplecta.solve_symplectic_ivp(
-            (0.0, problem.t1),
-            problem.q0,
-            problem.p0,
-            dHdq=lambda t, q, P: -scale(t) * problem.rhs(t, q, zero)[1],
-            dHdp=lambda t, q, P: problem.rhs(t, problem.q0, P / scale(t))[0],
-            method="implicit_midpoint",
-            n_steps=n,
-        )
-        y = np.array([sol.q[:, -1], sol.p[:, -1] / scale(problem.t1)])
-        return y if sol.success else np.full_like(y, np.nan)
-
-    return {"symplecta implicit midpoint": (solve, list(steps))}
 
 
 def heyoka_runs(problem, tolerances):

@@ -19,10 +19,8 @@ class Problem:
     q0: Any
     p0: Any
     t1: float
-    # The right-hand side `rhs(t, q, p)` in NumPy, and the integral of the damping rate
-    # from `t` to `t + h`, for solvers outside of JAX.
+    # The right-hand side `rhs(t, q, p)` in NumPy, for solvers outside of JAX.
     rhs: Callable | None = None
-    increment: Callable | None = None
     # Whether the force is linear in the positions.
     linear: bool = False
     # The solution at `t1`, where it has a closed form.
@@ -67,7 +65,6 @@ def pendulum():
         mechanics(lambda t, q, args: -jnp.sum(jnp.cos(q)), dps.ConstantDamping(gamma)),
         *(np.array([2.0]), np.array([0.0]), 100.0),
         lambda t, q, p: (p, -np.sin(q) - gamma * p),
-        lambda t, h: gamma * h,
     )
 
 
@@ -78,7 +75,6 @@ def decaying():
         mechanics(dps.QuadraticPotential(), dps.LogDamping(gamma, 1.0)),
         *(np.array([1.0]), np.array([0.0]), 100.0),
         lambda t, q, p: (p, -q - gamma / (t + 1) * p),
-        lambda t, h: gamma * math.log1p(h / (t + 1)),
         linear=True,
     )
 
@@ -100,7 +96,6 @@ def henon_heiles():
         mechanics(potential, dps.ConstantDamping(gamma)),
         *(np.array([0.1, -0.3]), np.array([0.3, 0.1]), 100.0),
         rhs,
-        lambda t, h: gamma * h,
     )
 
 
@@ -119,7 +114,6 @@ def kepler():
         np.array([0.0, math.sqrt((1 + e) / (1 - e))]),
         20 * math.pi,
         rhs,
-        lambda t, h: gamma * h,
         distances=distance,
     )
 
@@ -144,7 +138,6 @@ def chain(n=100):
         mechanics(potential, dps.ConstantDamping(gamma)),
         *(np.sin(2 * np.pi * np.arange(n) / n), np.zeros(n), 50.0),
         rhs,
-        lambda t, h: gamma * h,
     )
 
 
@@ -155,7 +148,6 @@ def relativistic():
         mechanics(potential, dps.ConstantDamping(gamma), dps.RelativisticKinetic()),
         *(np.array([2.0]), np.array([0.0]), 100.0),
         lambda t, q, p: (p / np.sqrt(np.sum(p**2) + 1), -q - gamma * p),
-        lambda t, h: gamma * h,
     )
 
 
@@ -179,7 +171,6 @@ def random_quadratic(n=1000, m=1250):
         mechanics(potential, dps.ConstantDamping(gamma)),
         *(np.ones(n), np.zeros(n), t1),
         lambda t, q, p: (p, -hessian @ q - gamma * p),
-        lambda t, h: gamma * h,
         linear=True,
         exact=exact,
     )

@@ -30,14 +30,10 @@ def pleiades():
 def detest_orbit():
     """Orbit D3 of Hull, Enright, Fellen and Sedgwick (1972)."""
     e = 0.5
-    return Problem(
-        "orbit D3",
-        mechanics(lambda t, q, args: -1 / jnp.sqrt(jnp.sum(q**2))),
-        [1 - e, 0.0],
-        [0.0, np.sqrt((1 + e) / (1 - e))],
-        20.0,
-        distances=lambda q: jnp.sqrt(jnp.sum(q**2)),
-    )
+    distance = lambda q: jnp.sqrt(jnp.sum(q**2))
+    system = mechanics(lambda t, q, args: -1 / distance(q))
+    p0 = [0.0, np.sqrt((1 + e) / (1 - e))]
+    return Problem("orbit D3", system, [1 - e, 0.0], p0, 20.0, distances=distance)
 
 
 def figure_eight():
@@ -70,13 +66,8 @@ def disc_with_drag():
         height = 3.0 + jnp.sqrt(z**2 + 0.28**2)
         return -10 / jnp.sqrt(x**2 + y**2 + height**2)
 
-    return Problem(
-        "disc, drag",
-        mechanics(potential, dps.ConstantDamping(0.01)),
-        [8.0, 0.0, 0.5],
-        [0.1, 0.9, 0.2],
-        150.0,
-    )
+    system = mechanics(potential, dps.ConstantDamping(0.01))
+    return Problem("disc, drag", system, [8.0, 0.0, 0.5], [0.1, 0.9, 0.2], 150.0)
 
 
 def argon():
@@ -146,10 +137,7 @@ def contraction():
         x, y = q
         return (x**2 + 1.5 * y**2) / 2 + x**2 * y**2 / 4
 
-    def log_scale(t):
-        return 2 * jnp.log1p(-t / 60)
-
-    system = mechanics(potential, log_scale)
+    system = mechanics(potential, lambda t: 2 * jnp.log1p(-t / 60))
     return Problem("contracting universe", system, [0.3, 0.2], [0.0, 0.1], 45.0)
 
 
@@ -161,9 +149,8 @@ def relativistic_quartic():
         x, y = q
         return (x**2 + y**2) / 2 + (x**4 + x**2 * y**2 + 2 * y**4) / 4
 
-    system = mechanics(
-        potential, dps.ConstantDamping(0.02), dps.RelativisticKinetic(1.0, 2.0)
-    )
+    kinetic = dps.RelativisticKinetic(1.0, 2.0)
+    system = mechanics(potential, dps.ConstantDamping(0.02), kinetic)
     return Problem("relativistic, quartic", system, [1.5, 0.5], [0.0, 1.0], 60.0)
 
 
@@ -206,28 +193,12 @@ def vortices():
         square = (q[i] - q[j]) ** 2 + (p[i] - p[j]) ** 2
         return -jnp.sum(strength[i] * strength[j] * jnp.log(square)) / (4 * np.pi)
 
-    return Problem(
-        "point vortices",
-        dps.Hamiltonian(energy),
-        [1.0, -1.0, 0.1, -0.2],
-        [0.1, 0.0, 0.8, -0.9],
-        60.0,
-    )
+    q0, p0 = [1.0, -1.0, 0.1, -0.2], [0.1, 0.0, 0.8, -0.9]
+    return Problem("point vortices", dps.Hamiltonian(energy), q0, p0, 60.0)
 
 
 PROBLEMS = [
-    pleiades,
-    detest_orbit,
-    figure_eight,
-    logarithmic_galaxy,
-    disc_with_drag,
-    argon,
-    fermi_pasta_ulam_alpha,
-    klein_gordon,
-    two_wells,
-    contraction,
-    relativistic_quartic,
-    accelerated_logistic,
-    morse_chain,
-    vortices,
+    *(pleiades, detest_orbit, figure_eight, logarithmic_galaxy, disc_with_drag, argon),
+    *(fermi_pasta_ulam_alpha, klein_gordon, two_wells, contraction),
+    *(relativistic_quartic, accelerated_logistic, morse_chain, vortices),
 ]

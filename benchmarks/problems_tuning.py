@@ -30,57 +30,35 @@ def toda(n=16):
 # Lubich and Wanner (2006), section I.2.4: days, astronomical units, solar masses.
 PLANETS = (
     2.95912208286e-4,
-    np.array(
-        [
-            1.00000597682,
-            0.000954786104043,
-            0.000285583733151,
-            0.0000437273164546,
-            0.0000517759138449,
-            1 / 1.3e8,
-        ]
-    ),
-    np.array(
-        [
-            [0, 0, 0],
-            [-3.5023653, -3.8169847, -1.5507963],
-            [9.0755314, -3.0458353, -1.6483708],
-            [8.3101420, -16.2901086, -7.2521278],
+    [1.00000597682, 0.000954786104043, 0.000285583733151]
+    + [0.0000437273164546, 0.0000517759138449, 1 / 1.3e8],
+    [
+        *([0, 0, 0], [-3.5023653, -3.8169847, -1.5507963]),
+        *([9.0755314, -3.0458353, -1.6483708], [8.3101420, -16.2901086, -7.2521278]),
+        *(
             [11.4707666, -25.7294829, -10.8169456],
             [-15.5387357, -25.2225594, -3.1902382],
-        ]
-    ),
-    np.array(
-        [
-            [0, 0, 0],
-            [0.00565429, -0.00412490, -0.00190589],
-            [0.00168318, 0.00483525, 0.00192462],
-            [0.00354178, 0.00137102, 0.00055029],
-            [0.00288930, 0.00114527, 0.00039677],
-            [0.00276725, -0.00170702, -0.00136504],
-        ]
-    ),
+        ),
+    ],
+    [
+        *([0, 0, 0], [0.00565429, -0.00412490, -0.00190589]),
+        *([0.00168318, 0.00483525, 0.00192462], [0.00354178, 0.00137102, 0.00055029]),
+        *([0.00288930, 0.00114527, 0.00039677], [0.00276725, -0.00170702, -0.00136504]),
+    ],
 )
 
 
 def planets():
     """The outer solar system over 200 years, with drag."""
-    gravity, mass, q0, v0 = PLANETS
+    gravity, mass, q0, v0 = map(np.array, PLANETS)
     i, j = np.triu_indices(len(mass), 1)
     weights = gravity * mass[i] * mass[j]
     distances = pair_distances(len(mass))
     potential = lambda t, q, args: -jnp.sum(weights / distances(q))
     kinetic = dps.QuadraticKinetic(mass[None])
     system = mechanics(potential, dps.ConstantDamping(1e-6), kinetic)
-    return Problem(
-        "outer planets, drag",
-        system,
-        q0.T,
-        (mass[:, None] * v0).T,
-        73000.0,
-        unit=600.0,
-        distances=distances,
-    )
+    p0, options = (mass[:, None] * v0).T, {"unit": 600.0, "distances": distances}
+    return Problem("outer planets, drag", system, q0.T, p0, 73000.0, **options)
 
 
 def molecules(n=16):
@@ -97,13 +75,9 @@ def molecules(n=16):
         inverse = 1 / jnp.sum(d**2, axis=0) ** 3
         return 4 * jnp.sum(inverse**2 - inverse)
 
-    return Problem(
-        "molecules, friction",
-        mechanics(potential, dps.ConstantDamping(0.1)),
-        q0,
-        p0 - p0.mean(axis=1, keepdims=True),
-        5.0,
-    )
+    system = mechanics(potential, dps.ConstantDamping(0.1))
+    p0 = p0 - p0.mean(axis=1, keepdims=True)
+    return Problem("molecules, friction", system, q0, p0, 5.0)
 
 
 def elastic_pendulum():
@@ -113,13 +87,8 @@ def elastic_pendulum():
         length = jnp.sqrt(jnp.sum(q**2))
         return 50 * (length - 1) ** 2 / 2 + q[1]
 
-    return Problem(
-        "elastic pendulum",
-        mechanics(potential, dps.ConstantDamping(0.02)),
-        [1.0, 0.0],
-        [0.0, 0.0],
-        50.0,
-    )
+    system = mechanics(potential, dps.ConstantDamping(0.02))
+    return Problem("elastic pendulum", system, [1.0, 0.0], [0.0, 0.0], 50.0)
 
 
 def duffing():
@@ -166,12 +135,6 @@ def fermi_pasta_ulam(m=3, omega=20.0):
 
 
 PROBLEMS = [
-    *SEVEN,
-    toda,
-    planets,
-    molecules,
-    elastic_pendulum,
-    duffing,
-    sine_gordon,
+    *(*SEVEN, toda, planets, molecules, elastic_pendulum, duffing, sine_gordon),
     fermi_pasta_ulam,
 ]

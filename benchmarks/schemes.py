@@ -11,7 +11,6 @@ output does not depend on the machine.
 import statistics
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import problems
@@ -19,8 +18,6 @@ from _report import command_line, Table
 from _schemes import SCHEMES, stability_limit
 from _solve import states
 
-
-jax.config.update("jax_enable_x64", True)
 
 # The first of each order is what the others are compared to.
 NAMES = (
@@ -52,7 +49,7 @@ def error_constant(problem, exact, scheme):
         steps = round(problem.t1) * 2 ** (half_doublings / 2) / evaluations
         steps = jnp.asarray(max(1, round(steps)))
         times = jnp.zeros(()), jnp.asarray(problem.t1)
-        y = solve(problem.hamiltonian, solver, times, problem.y0, steps)
+        y = solve(problem.system, solver, times, problem.y0, steps)
         error = float(np.max(np.abs(np.array(y) - exact)))
         if 1e-10 < error < 1e-3:
             constants.append(error * (int(steps) * evaluations) ** order)

@@ -46,10 +46,7 @@ TUNED = ("TunedRKN6", "TunedLinear8")
 
 def oscillator(moves, kick_first, z):
     """The matrices of a step, less those of a rotation by `z`."""
-    rows = [
-        [jnp.ones_like(z), jnp.zeros_like(z)],
-        [jnp.zeros_like(z), jnp.ones_like(z)],
-    ]
+    rows = [[jnp.full_like(z, i == j) for j in (0, 1)] for i in (0, 1)]
     for i, move in enumerate(moves):
         to, sign = (1, -1) if (i % 2 == 0) == kick_first else (0, 1)
         pair = zip(rows[to], rows[1 - to], strict=True)

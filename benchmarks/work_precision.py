@@ -5,8 +5,8 @@ interleaved in one process. A point is the median time and the error of the solu
 the final time: the largest entry, relative to that of the solution, since damping
 shrinks both, against `reference`. Tables give the time to reach an error, read off each
 method's curve, and the geometric mean over the problems of (best Diffrax solver) / (our
-best). The figure goes to `docs/img/`. SciPy, heyoka, pyhamsys and symplecta are
-measured if they are installed.
+best). The figure goes to `docs/img/`. SciPy and heyoka are measured if they are
+installed.
 
 `--set tuning` and `--set test` measure the two halves of a larger set of problems,
 without solvers from outside of JAX, with the worst problem beside the mean: nothing in
@@ -21,9 +21,8 @@ import math
 import multiprocessing
 import pathlib
 import platform
-import statistics
 import time
-from typing import Any
+from functools import partial
 
 import diffrax as dfx
 import jax
@@ -33,33 +32,22 @@ import problems
 import problems_test
 import problems_tuning
 from _plot import error_against_time, FOLDER
-from _report import command_line, Table
+from _report import command_line, means, Table
 from _schemes import DIFFRAX, Scheme, SCHEMES
 from _solve import relative_error, states
-from _timing import error_curves, time_to
-from outside import heyoka_runs, pyhamsys_runs, scipy_runs, STEPS, symplecta_runs
+from _timing import error_curves, fastest, time_to
+from outside import heyoka_runs, scipy_runs
 
 import diffrax_presym as dps
 
 
-jax.config.update("jax_enable_x64", True)
-
 TARGETS = (1e-3, 1e-6, 1e-9)
 TOLERANCES = tuple(10.0**-k for k in range(2, 14))
 OURS = [
-    "PresymplecticLeapfrog",
-    "Suzuki4",
-    "SofroniouSpaletta8",
-    "BlanesMoan4",
-    "BlanesMoan6",
-    "BlanesMoanRKN4",
-    "BlanesMoanRKN6",
-    "BlanesCasasRKN8",
-    "TunedRKN6",
-    "TunedLinear8",
-    "SymmetricMultistep(8)",
-    "SymmetricMultistep(10)",
-    "SymmetricMultistep(12)",
+    *("PresymplecticLeapfrog", "Suzuki4", "SofroniouSpaletta8"),
+    *("BlanesMoan4", "BlanesMoan6", "BlanesMoanRKN4", "BlanesMoanRKN6"),
+    *("BlanesCasasRKN8", "TunedRKN6", "TunedLinear8"),
+    *(f"SymmetricMultistep({order})" for order in (8, 10, 12)),
 ]
 # For energies that are not separable; Gauss to rounding, and to two tolerances.
 OTHERS = {
@@ -83,44 +71,33 @@ SETS = {
 SAVED = 201
 
 
-def solver_of(problem, terms, solver, adaptive=False, ts=None, density=None):
+def solver_of(problem, solver, terms=None, ts=None, **options):
     """`solve(x)`, with `x` the number of steps, or the tolerance.
 
     It returns the final state, or those at all of `ts`.
     """
-    times, ours = (
-        (0.0, problem.t1),
-        isinstance(solver, dps.extend.AbstractPresymplecticSolver),
-    )
-    options: dict[str, Any] = {}
     if ts is not None:
         options["saveat"] = dfx.SaveAt(ts=jnp.asarray(ts))
-    if density is not None:
-        options["density"] = density
-    elif ours:
-        reversible = solver.reverse is not None
-        fast = dps.FixedStepAdjoint if reversible else dps.FixedStepAdjoint
-        options["adjoint"] = fast()
-    args = terms, solver, times, problem.y0
-    return jax.jit(lambda x: states(*args, x, adaptive=adaptive, **options))
+    terms = problem.system if terms is None else terms
+    args = terms, solver, (0.0, problem.t1), problem.y0
+    return jax.jit(lambda x: states(*args, x, **options))
 
 
 def semi_implicit_euler(problem, ts=None):
     """Diffrax's only symplectic solver, on the canonical equations, which it needs."""
-    h = problem.hamiltonian
-    velocity = lambda t, P, args: h.velocity(t, None, h.from_canonical(t, P))
-    force = lambda t, q, args: h.to_canonical(t, h.force(t, q, None))
-    terms = (dfx.ODETerm(velocity), dfx.ODETerm(force))
-    solve = solver_of(problem, terms, dfx.SemiImplicitEuler(), ts=ts)
+    s = problem.system
+    velocity = lambda t, P, args: s.velocity(t, None, s.from_canonical(t, P))
+    force = lambda t, q, args: s.to_canonical(t, s.force(t, q, jnp.zeros_like(q)))
+    terms = dfx.ODETerm(velocity), dfx.ODETerm(force)
+    solve = solver_of(problem, dfx.SemiImplicitEuler(), terms, ts)
+    mechanical = s.from_canonical if ts is None else jax.vmap(s.from_canonical)
+    end = jnp.asarray(problem.t1 if ts is None else ts)
 
-    @jax.jit
-    def mechanical(x):
+    def run(x):
         q, P = solve(x)
-        if ts is None:
-            return q, h.from_canonical(problem.t1, P)
-        return q, jax.vmap(h.from_canonical)(jnp.asarray(ts), P)
+        return q, mechanical(end, P)
 
-    return mechanical
+    return jax.jit(run)
 
 
 def step_counts(problem, evaluations, quick, saved=False):
@@ -142,10 +119,10 @@ def step_counts(problem, evaluations, quick, saved=False):
     return [jnp.asarray(n) for n in counts]
 
 
-def accepts(solver, problem, term):
+def accepts(solver, problem):
     """Whether a solver supports the system, as it says when a solve is traced."""
     try:
-        jax.eval_shape(solver_of(problem, term, solver), jnp.asarray(10))
+        jax.eval_shape(solver_of(problem, solver), jnp.asarray(10))
     except ValueError:
         return False
     return True
@@ -153,90 +130,70 @@ def accepts(solver, problem, term):
 
 def all_runs(problem, quick, ts=None):
     """Every method: `{(group, name): (solve, sweep)}`."""
-    term = problem.hamiltonian
-    run_of = lambda *args, **options: solver_of(problem, *args, ts=ts, **options)
+    run_of = partial(solver_of, problem, ts=ts)
+    counts = partial(step_counts, problem, quick=quick, saved=ts is not None)
     runs = {}
-    separable = problem.splits != ()
+    separable = problem.system.splits != ()
     ours = {name: SCHEMES[name] for name in OURS} if separable else OTHERS
     for name, (solver, _, evaluations) in ours.items():
-        if (problem.linear or "Linear" not in name) and accepts(solver, problem, term):
-            sweep = step_counts(problem, evaluations, quick, ts is not None)
-            runs["ours", name] = run_of(term, solver), sweep
+        if (problem.linear or "Linear" not in name) and accepts(solver, problem):
+            runs["ours", name] = run_of(solver), counts(evaluations)
     if problem.distances is not None:
         density = dps.DistanceDensity(1.5, problem.distances)
         for name in VARIABLE:
             solver, _, evaluations = SCHEMES[name]
-            run = run_of(term, solver, density=density)
             sweep = step_counts(problem, evaluations, quick)
-            runs["ours", f"{name}, density"] = run, sweep
+            runs["ours", f"{name}, density"] = run_of(solver, density=density), sweep
     for name, (solver, _, evaluations) in DIFFRAX.items():
         tolerances = [jnp.asarray(x) for x in TOLERANCES]
-        adaptive = run_of(term, solver, adaptive=True)
-        runs["diffrax", f"{name}, adaptive"] = adaptive, tolerances
-        sweep = step_counts(problem, evaluations, quick, ts is not None)
-        runs["diffrax", f"{name}, constant"] = run_of(term, solver), sweep
-    if separable and isinstance(problem.q0, np.ndarray):
+        runs["Diffrax", f"{name}, adaptive"] = run_of(solver, adaptive=True), tolerances
+        runs["Diffrax", f"{name}, constant"] = run_of(solver), counts(evaluations)
+    if separable:
         run = semi_implicit_euler(problem, ts)
-        runs["diffrax", "SemiImplicitEuler"] = (
-            run,
-            step_counts(problem, 1, quick, ts is not None),
-        )
+        runs["Diffrax", "SemiImplicitEuler"] = run, counts(1)
     if problem.rhs is None or ts is not None:
         return runs
     tolerances = TOLERANCES[1::4] if quick else TOLERANCES
-    steps = STEPS[:2] if quick else STEPS
     outside = heyoka_runs(problem, tolerances) | scipy_runs(problem, tolerances[::2])
-    outside |= pyhamsys_runs(problem, steps) | symplecta_runs(problem, steps)
     return runs | {("outside", name): run for name, run in outside.items()}
 
 
-def best_of(curves, group, target):
-    found = [
-        (time_to(curve, target), name)
-        for (g, name), curve in curves.items()
-        if g == group
-    ]
-    return min(found, default=(math.inf, "-"))
-
-
 def tables(results):
-    ratios = {target: [] for target in TARGETS}
-    heyoka = {target: [] for target in TARGETS}
+    ratios, heyoka = [], []
     for target in TARGETS:
         label = f"to an error of {target:.0e}:<22"
         table = Table("", label, "ours:>19", "us:>6.0f", "Diffrax's:>19", "us:>6.0f")
+        both = []
         for problem, curves in results.items():
-            ours, mine = best_of(curves, "ours", target)
-            theirs, name = best_of(curves, "diffrax", target)
-            table.row(problem, mine, ours * 1e6, name, theirs * 1e6)
-            ratios[target].append(theirs / ours)
-            if ("outside", "heyoka") in curves:
-                taylor = time_to(curves["outside", "heyoka"], target)
-                heyoka[target].append(ours / taylor)
-    print("\nBest Diffrax solver over our best, by problem and in geometric mean")
-    show(ratios, "{:>7.1f}")
-    if any(heyoka.values()):
-        print("Our best over heyoka, one trajectory, by problem and in geometric mean")
-        show(heyoka, "{:>7.2f}")
-
-
-def show(ratios, form):
-    for target, each in ratios.items():
-        # A sweep that ends before the target leaves no ratio.
-        known = [r for r in each if 0 < r < math.inf]
-        mean, least = ("      -", "      -")
-        if known:
-            mean = form.format(statistics.geometric_mean(known))
-            least = form.format(min(known))
-        line = "".join(map(form.format, each))
-        print(f"  at {target:.0e}: {line}   mean {mean}   least {least}")
+            best = [fastest(curves, target, x) for x in ("ours", "Diffrax")]
+            cells = [(name, seconds * 1e6) for seconds, name in best]
+            table.row(problem, *cells[0], *cells[1])
+            taylor = time_to(curves.get(("outside", "heyoka"), []), target)
+            both.append((best[0][0], best[1][0], taylor))
+        over = lambda a, b: a / b if max(a, b) < math.inf else None
+        ratios.append([over(theirs, ours) for ours, theirs, _ in both])
+        heyoka.append([over(ours, taylor) for ours, _, taylor in both])
+    columns = [f"{target:.0e}:>7.2f" for target in TARGETS]
+    captions = (
+        "Best Diffrax solver over our best",
+        "Our best over heyoka, one trajectory",
+    )
+    for caption, columns_of in zip(captions, (ratios, heyoka), strict=True):
+        rows = list(zip(*columns_of, strict=True))
+        mean, least = means(rows)
+        if any(mean):
+            table = Table(caption, ":<24", *columns)
+            for problem, row in zip(results, rows, strict=True):
+                table.row(problem, *row)
+            table.row("geometric mean", *mean)
+            table.row("least", *least)
 
 
 def picture(results, path):
     keys = dict.fromkeys(key for curves in results.values() for key in curves)
     groups = [
         [name for g, name in keys if g == group]
-        for group in ("ours", "diffrax", "outside")
+        for group in ("ours", "Diffrax", "outside")
     ]
     named = {
         problem: {name: curve for (_, name), curve in curves.items()}

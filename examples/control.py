@@ -48,11 +48,11 @@ def direction(angle):
 
 def throw(speed, angle, friction, adjoint, dense=False):
     """The flight of a ball of unit mass, until it reaches the ground."""
-    hamiltonian = dps.ConformalHamiltonian(
+    system = dps.MechanicalSystem(
         dps.QuadraticKinetic(), potential, dps.ConstantDamping(friction)
     )
     return dfx.diffeqsolve(
-        hamiltonian,
+        system,
         # Order six at the steps and between them, where the event is located.
         dps.BlanesMoanRKN6(),
         t0=0.0,

@@ -53,9 +53,9 @@ def chain(n, dampers):
     return dps.LagrangianSystem(mass, potential, friction=dps.ViscousDamping(dampers))
 
 
-def angles(ts, q0, solver, dt0, controller, adjoint, logs):
+def motion(ts, q0, solver, controller, adjoint, dt0, logs, throw=True):
     """The angles of all joints at the times of the measurements."""
-    sol = dfx.diffeqsolve(
+    return dfx.diffeqsolve(
         chain(len(q0), jnp.exp(logs)),
         solver,
         t0=0.0,
@@ -66,9 +66,12 @@ def angles(ts, q0, solver, dt0, controller, adjoint, logs):
         stepsize_controller=controller,
         adjoint=adjoint,
         max_steps=4096,
+        throw=throw,
     )
-    assert sol.ys is not None
-    return sol.ys
+
+
+def angles(*problem):
+    return motion(*problem).ys
 
 
 def misfit(solve, data, logs):
@@ -117,20 +120,13 @@ def main():
     # The step for the error wanted, with a first guess of the dampers.
     guess = jnp.log(jnp.full(n, 0.05))
     scheme = dps.PresymplecticGauss(4, tolerance=ERROR / 1000)
-    chosen = dps.choose_step(
-        chain(n, jnp.exp(guess)),
-        scheme,
-        0.0,
-        DURATION,
-        (q0, jnp.zeros(n)),
-        rtol=0.0,
-        atol=ERROR,
-        ts=ts,
-    )
-    fixed = dfx.ConstantStepSize()
+    problem = ts, q0, scheme, dfx.ConstantStepSize()
     # Steps are undone as accurately as the iteration of the scheme.
     adjoint = dps.FixedStepAdjoint(tol=ERROR)
-    gauss = partial(angles, ts, q0, scheme, chosen.dt0, fixed, adjoint)
+    # The iteration may fail with a step that is too long.
+    solve = jax.jit(lambda dt0: motion(*problem, adjoint, dt0, guess, throw=False))
+    chosen = dps.choose_step(solve, 0.0, DURATION, rtol=0.0, atol=ERROR)
+    gauss = partial(angles, *problem, adjoint, chosen.dt0)
     print(chosen)
 
     def tsit5(tolerance):
@@ -138,7 +134,7 @@ def main():
         tolerance = jnp.asarray(tolerance)
         controller = dfx.PIDController(rtol=tolerance, atol=tolerance)
         adjoint = dfx.RecursiveCheckpointAdjoint()
-        return partial(angles, ts, q0, dfx.Tsit5(), None, controller, adjoint)
+        return partial(angles, ts, q0, dfx.Tsit5(), controller, adjoint, None)
 
     exact = tsit5(1e-11)(jnp.log(truth))
     error = lambda solve: float(jnp.max(jnp.abs(solve(jnp.log(truth)) - exact)))
@@ -161,7 +157,7 @@ def main():
         options=dict(ftol=1e-12, gtol=1e-9, maxiter=300),
     )
     logs = jnp.asarray(fit.x)
-    forward = partial(angles, ts, q0, scheme, chosen.dt0, fixed, dfx.ForwardMode())
+    forward = partial(angles, *problem, dfx.ForwardMode(), chosen.dt0)
     slopes = jax.jit(jax.jacfwd(forward))(logs).reshape(-1, n)
     spread = NOISE * np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
     estimate = np.exp(logs)

@@ -50,21 +50,20 @@ FUNCTION = re.compile(r"^(?:ENTRY )?(%[\w.-]+) .*?^}", re.DOTALL | re.MULTILINE)
 
 
 def pendulum():
-    return dps.ConformalHamiltonian(
+    return dps.MechanicalSystem(
         dps.QuadraticKinetic(),
         lambda t, q, args: -jnp.sum(jnp.cos(q)),
         dps.ConstantDamping(0.1),
     )
 
 
-def solver_of(hamiltonian, solver, dt0=0.25, throw=False, **kwargs):
+def solver_of(system, solver, dt0=0.25, throw=False, **kwargs):
     """The solve of a batch of initial states, from `y0` to the state at `T1`."""
-    term = hamiltonian
 
     def solve(y0):
         # `throw=True` would check for failures across all devices.
         sol = dfx.diffeqsolve(
-            term,
+            system,
             solver,
             t0=0.0,
             t1=T1,
@@ -145,8 +144,8 @@ def patterns(sharding, y0):
         dt0=None, stepsize_controller=dfx.StepTo(jnp.linspace(0.0, T1, 241))
     )
     event = dfx.Event(lambda t, y, args, **kwargs: y[0] > 100.0)
-    hamiltonian = pendulum()
-    adaptive = solver_of(hamiltonian, tsit5, **adapt)
+    system = pendulum()
+    adaptive = solver_of(system, tsit5, **adapt)
     # Each device runs its own program.
     alone = lambda solve: jax.shard_map(
         solve,
@@ -156,14 +155,14 @@ def patterns(sharding, y0):
         check_vma=False,
     )
     cases = {
-        "constant steps": solver_of(hamiltonian, leapfrog),
-        "constant steps, SaveAt(ts=...)": solver_of(hamiltonian, leapfrog, **points),
-        "StepTo": solver_of(hamiltonian, leapfrog, **grid),
-        "constant steps, throw=True": solver_of(hamiltonian, leapfrog, throw=True),
-        "constant steps, an event": solver_of(hamiltonian, leapfrog, event=event),
+        "constant steps": solver_of(system, leapfrog),
+        "constant steps, SaveAt(ts=...)": solver_of(system, leapfrog, **points),
+        "StepTo": solver_of(system, leapfrog, **grid),
+        "constant steps, throw=True": solver_of(system, leapfrog, throw=True),
+        "constant steps, an event": solver_of(system, leapfrog, event=event),
         "adaptive steps": adaptive,
         "adaptive steps, in shard_map": alone(adaptive),
-        "an event, in shard_map": alone(solver_of(hamiltonian, leapfrog, event=event)),
+        "an event, in shard_map": alone(solver_of(system, leapfrog, event=event)),
     }
     print("\nCommunication in the compiled program of a solve with")
     for name, solve in cases.items():

@@ -58,13 +58,13 @@ def potential(t, q, args):
 def positions(logs, starts, ts, adjoint, step=STEP):
     """The positions of the masses, for every release."""
     mass, friction, *springs = jnp.split(jnp.exp(logs), [2, 3, 6])
-    hamiltonian = dps.ConformalHamiltonian(
+    system = dps.MechanicalSystem(
         dps.QuadraticKinetic(jnp.concatenate([jnp.ones(1), mass])[None]),
         potential,
         dps.ConstantDamping(friction[0]),
     )
     sol = dfx.diffeqsolve(
-        hamiltonian,
+        system,
         dps.BlanesMoanRKN4(),
         t0=0.0,
         t1=ts[-1],

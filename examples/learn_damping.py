@@ -56,10 +56,10 @@ def potential(t, q, curvatures):
 def objectives(damping, batch, steps):
     """The logarithm of the relative objective, for every problem and time."""
     curvatures, q0 = batch
-    hamiltonian = dps.ConformalHamiltonian(dps.QuadraticKinetic(), potential, damping)
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), potential, damping)
     each = lambda q: jnp.log(jnp.sum(curvatures * q**2, axis=-1))
     sol = dfx.diffeqsolve(
-        hamiltonian,
+        system,
         dps.PresymplecticLeapfrog(),
         t0=T0,
         t1=T0 + steps * STEP,

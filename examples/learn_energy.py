@@ -66,7 +66,7 @@ class Plain(eqx.Module):
 
 
 def mechanical(potential, friction, y0, ts):
-    system = dps.ConformalHamiltonian(
+    system = dps.MechanicalSystem(
         dps.QuadraticKinetic(), potential, dps.ConstantDamping(friction)
     )
     solver, adjoint = dps.PresymplecticLeapfrog(), dps.FixedStepAdjoint()

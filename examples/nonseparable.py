@@ -72,7 +72,7 @@ def black_hole(t, q, p, args):
 
 
 def system(energy, gamma):
-    return dps.ConformalHamiltonian(energy=energy, damping=dps.ConstantDamping(gamma))
+    return dps.Hamiltonian(energy, dps.ConstantDamping(gamma))
 
 
 # Hamiltonian, initial state, final time, the longest step of order 4, and the ratio of

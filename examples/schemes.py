@@ -83,13 +83,12 @@ def decaying_exact(t):
 def hamiltonian_error(hamiltonian, exact, q0, max_steps):
     """The largest error in the Hamiltonian over [0, 10], as in the paper's figures."""
     y0 = (jnp.array(q0), jnp.array(0.0))
-    term = hamiltonian
     values = jax.vmap(hamiltonian.canonical)
 
     def error(solver, h):
         # An array `dt0` and one `max_steps`: one compilation for all step sizes.
         sol = dfx.diffeqsolve(
-            term,
+            hamiltonian,
             solver,
             t0=0.0,
             t1=10.0,
@@ -110,11 +109,10 @@ def hamiltonian_error(hamiltonian, exact, q0, max_steps):
 def solution_error(hamiltonian, q0, t1):
     """The error of the solution at `t1`, against Dopri8 with tiny steps."""
     y0 = (jnp.array(q0), jnp.array(0.0))
-    term = hamiltonian
 
     def solve(solver, h):
         return dfx.diffeqsolve(
-            term, solver, t0=0.0, t1=t1, dt0=jnp.asarray(h), y0=y0, max_steps=None
+            hamiltonian, solver, 0.0, t1, jnp.asarray(h), y0, max_steps=None
         ).ys
 
     exact = solve(dfx.Dopri8(), 0.005)
@@ -174,7 +172,6 @@ def canonical_terms(gamma):
 def speed(quick):
     """Time to solve the damped pendulum to t = 100, against the error there."""
     y0, t1, gamma = (jnp.array(2.0), jnp.array(0.0)), 100.0, 0.1
-    term = PENDULUM
 
     def constant(terms, solver):
         @jax.jit
@@ -190,7 +187,7 @@ def speed(quick):
         def solve(tol):
             controller = dfx.PIDController(rtol=tol, atol=tol)
             return dfx.diffeqsolve(
-                term,
+                PENDULUM,
                 solver,
                 t0=0.0,
                 t1=t1,
@@ -204,17 +201,17 @@ def speed(quick):
 
     steps, tols = [0.5, 0.25, 0.1, 0.05, 0.02], [1e-2, 1e-4, 1e-6, 1e-8, 1e-10]
     runs = {
-        "leapfrog": (constant(term, dps.PresymplecticLeapfrog()), steps),
-        "Yoshida 4": (constant(term, dps.PresymplecticYoshida4()), steps),
-        "Blanes-Moan RKN 4": (constant(term, dps.BlanesMoanRKN4()), steps),
-        "Blanes-Moan RKN 6": (constant(term, dps.BlanesMoanRKN6()), steps),
+        "leapfrog": (constant(PENDULUM, dps.PresymplecticLeapfrog()), steps),
+        "Yoshida 4": (constant(PENDULUM, dps.PresymplecticYoshida4()), steps),
+        "Blanes-Moan RKN 4": (constant(PENDULUM, dps.BlanesMoanRKN4()), steps),
+        "Blanes-Moan RKN 6": (constant(PENDULUM, dps.BlanesMoanRKN6()), steps),
         "Diffrax SemiImplicitEuler": (
             constant(canonical_terms(gamma), dfx.SemiImplicitEuler()),
             steps,
         ),
         "Diffrax Tsit5, adaptive": (adaptive(dfx.Tsit5()), tols),
     }
-    exact = constant(term, dfx.Dopri8())(0.005)
+    exact = constant(PENDULUM, dfx.Dopri8())(0.005)
     repeats = 3 if quick else 15
     curves = {name: [] for name in runs}
     # The runs alternate, so that changes of the load of the machine affect all alike.
@@ -245,11 +242,10 @@ def speed(quick):
 
 def basins(n):
     """The well in which a damped particle settles, for a grid of initial states."""
-    term = DOUBLE_WELL
     q0, p0 = jnp.meshgrid(jnp.linspace(-2.5, 2.5, n), jnp.linspace(-2.5, 2.5, n))
     print("\nDouble well, one solve for", n * n, "initial states:")
     sol = dfx.diffeqsolve(
-        term,
+        DOUBLE_WELL,
         dps.PresymplecticLeapfrog(),
         t0=0.0,
         t1=60.0,

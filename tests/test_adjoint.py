@@ -376,8 +376,8 @@ def damping_gradient(adjoint, inputs):
         q0, gamma = inputs
         dtype = q0.dtype
         term = dps.ConformalHamiltonian(
-                dps.QuadraticKinetic(), undriven, dps.ConstantDamping(gamma)
-            )
+            dps.QuadraticKinetic(), undriven, dps.ConstantDamping(gamma)
+        )
         # Early states are saved, as the final state does not depend on the initial one.
         saveat = dfx.SaveAt(ts=jnp.linspace(0.0, 4.0, 20, dtype=dtype))
         t0, t1, dt0 = (jnp.asarray(t, dtype) for t in (0.0, 100.0, 1 / 16))
@@ -554,5 +554,3 @@ def test_whatever_holds_an_array(holder):
 def test_a_checkpointed_potential_is_stepped():
     value = _held(1.3, HOLDERS["checkpoint"], REVERSIBLE)
     np.testing.assert_allclose(value, _held_by_checkpoints()[0], rtol=1e-14)
-
-

@@ -162,9 +162,7 @@ def test_drift_is_the_flow_without_the_objective(mirror):
 
     # Its derivative is the vector field, so it is the flow.
     y, dy = rate(jnp.array(0.6))
-    assert_close(
-        dy, eqx.filter_jit(H.vf)(T0 + 0.6, y, None), 1e-12
-    )
+    assert_close(dy, eqx.filter_jit(H.vf)(T0 + 0.6, y, None), 1e-12)
 
 
 @over("euclidean", "entropy", "simplex")

@@ -32,14 +32,14 @@ def driven(t, q, args):
 
 def term_of(potential, damping=0.1):
     return dps.ConformalHamiltonian(
-            dps.QuadraticKinetic(), potential, dps.ConstantDamping(damping)
-        )
+        dps.QuadraticKinetic(), potential, dps.ConstantDamping(damping)
+    )
 
 
 PENDULUM = term_of(cosine)
 SPRING = dps.MechanicalSystem(
-        dps.QuadraticKinetic(), lambda t, q, args: jnp.sum(q**2) / 2
-    )
+    dps.QuadraticKinetic(), lambda t, q, args: jnp.sum(q**2) / 2
+)
 Y0 = jnp.array([2.0, 0.5]), jnp.array([0.0, 0.3])
 ORBIT = jnp.array([0.7, 0.0]), jnp.array([0.0, 1.36])
 FORCED = {"x": jnp.array([[1.0, 0.2]])}, {"x": jnp.array([[0.0, -0.5]])}
@@ -48,8 +48,25 @@ REGULAR = jnp.linspace(0.0, 20.0, 41)
 IRREGULAR = jnp.sort(jax.random.uniform(jax.random.key(0), (30,), maxval=20.0))
 
 
+def choose_step(
+    system, solver, t0, t1, y0, *, ts=None, args=None, max_steps=1_000_000, **tolerances
+) -> dps.ChosenStep:
+    """The step for a problem that is saved at given times, or at its end."""
+    saveat = dfx.SaveAt(t1=True) if ts is None else dfx.SaveAt(ts=ts)
+
+    @jax.jit
+    def solve(dt0):
+        return dfx.diffeqsolve(
+            *(system, solver, t0, t1, dt0, y0, args),
+            **{"saveat": saveat, "max_steps": None, "throw": False},
+            adjoint=dps.FixedStepAdjoint(),
+        )
+
+    return dps.choose_step(solve, t0, t1, max_steps=max_steps, **tolerances)
+
+
 def choose(*problem: Any, tolerance: float, **options: Any) -> dps.ChosenStep:
-    return dps.choose_step(*problem, rtol=tolerance, atol=tolerance, **options)
+    return choose_step(*problem, rtol=tolerance, atol=tolerance, **options)
 
 
 def exact(term, t0, t1, y0, ts, args=None):
@@ -140,7 +157,7 @@ def test_the_tolerance_is_reached(
     term, solver, t0, t1, y0, ts, args, rtol, atol, within
 ):
     tolerances = {"rtol": rtol, "atol": atol}
-    step = dps.choose_step(term, solver, t0, t1, y0, ts=ts, args=args, **tolerances)
+    step = choose_step(term, solver, t0, t1, y0, ts=ts, args=args, **tolerances)
     assert step.dt0 == pytest.approx((t1 - t0) / step.steps, rel=1e-15)
     got = error_of(step, term, solver, t0, t1, y0, ts, args, **tolerances)
     assert got == pytest.approx(step.error, rel=0.1)
@@ -203,7 +220,7 @@ def test_steps_do_not_follow_the_phase_of_a_force():
     phase = lambda t, q, args: -jnp.sum(q) * jnp.cos(2 * jnp.pi * 160 * t)
     term = dps.MechanicalSystem(dps.QuadraticKinetic(), phase)
     y0 = jnp.array([0.0]), jnp.array([1.0])
-    step = dps.choose_step(
+    step = choose_step(
         *(term, dps.PresymplecticLeapfrog("position"), 0.0, 1.0, y0),
         ts=jnp.linspace(0.0, 1.0, 161),
         rtol=0.0,
@@ -215,7 +232,7 @@ def test_steps_do_not_follow_the_phase_of_a_force():
 def test_what_is_exact_takes_one_step():
     free = dps.MechanicalSystem(dps.QuadraticKinetic(), lambda t, q, args: 0.0 * q[0])
     y0 = jnp.array([0.0, 1.0]), jnp.array([0.0, 2.0])
-    step = dps.choose_step(free, dps.Strang(), 0.0, 10.0, y0, rtol=1e-6, atol=0.0)
+    step = choose_step(free, dps.Strang(), 0.0, 10.0, y0, rtol=1e-6, atol=0.0)
     assert step.steps == 1 and np.isnan(step.order)
 
 
@@ -309,22 +326,17 @@ def test_tolerances_that_cannot_be_reached(
         ({"max_steps": 0}, "max_steps=.* must be a positive integer, but got 0"),
         ({"t1": 0.0}, "two different finite times"),
         ({"t1": float("inf")}, "two different finite times"),
-        ({"ts": jnp.array([2.0, 1.0])}, "must be sorted"),
-        ({"ts": jnp.array([1.0, 30.0])}, "must lie between `t0` and `t1`.* has 30.0"),
-        ({"ts": jnp.array([-1.0, 3.0])}, "must lie between `t0` and `t1`.* has -1.0"),
-        ({"ts": jnp.zeros(0)}, r"has shape \(0,\)"),
-        ({"ts": 3.0}, r"has shape \(\)"),
     ],
 )
 def test_bad_input(changes, message):
     given = {"t0": 0.0, "t1": 20.0, "y0": Y0, "rtol": 1e-3, "atol": 1e-3} | changes
     with pytest.raises(ValueError, match=message):
-        dps.choose_step(PENDULUM, dps.TunedRKN6(), **given)
+        choose_step(PENDULUM, dps.TunedRKN6(), **given)
 
 
 def test_schemes_that_refuse_the_system():
     coupled = dps.Hamiltonian(lambda t, q, p, args: jnp.sum((q**2 + 1) * (p**2 + 1)))
-    with pytest.raises(ValueError, match="PresymplecticCoupled"):
+    with pytest.raises(ValueError, match="PresymplecticGauss"):
         choose(coupled, dps.TunedRKN6(), 0.0, 1.0, Y0, tolerance=1e-3)
 
 

@@ -518,9 +518,7 @@ def test_an_implicit_step_without_a_solution_is_a_result():
     finder = optx.Newton(rtol=1e-12, atol=1e-12)
     solver = dps.PresymplecticLeapfrog("position", finder)
     y0 = (jnp.array([3.0]), jnp.array([8.0]))
-    sol = dfx.diffeqsolve(
-        *(HOPELESS, solver, 0.0, 1.0, 0.125, y0), throw=False
-    )
+    sol = dfx.diffeqsolve(*(HOPELESS, solver, 0.0, 1.0, 0.125, y0), throw=False)
     assert sol.result != dfx.RESULTS.successful
     assert sol.stats["num_steps"] == 1
 

@@ -3,7 +3,6 @@
 Each message says what was given, what is expected, and what to write instead.
 """
 
-import re
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -15,7 +14,16 @@ import lineax as lx
 import numpy as np
 import optimistix as optx
 import pytest
-from helpers import assert_close, each, harmonic, mixed_energy, oscillator, Scheme, WAYS
+from helpers import (
+    assert_close,
+    CARRIES,
+    each,
+    harmonic,
+    mixed_energy,
+    oscillator,
+    Scheme,
+    WAYS,
+)
 
 import diffrax_presym as dps
 
@@ -41,8 +49,8 @@ def trace(term, solver, y0=PAIR, **kwargs):
 
 def system(kinetic: Callable = KINETIC, potential=harmonic, **kwargs):
     """Trace a solve of a system with invalid parts."""
-    hamiltonian = dps.ConformalHamiltonian(kinetic, potential, **kwargs)
-    trace(hamiltonian, LEAPFROG)
+    solver = dps.PresymplecticGauss(2) if kwargs else LEAPFROG
+    trace(dps.MechanicalSystem(kinetic, potential, **kwargs), solver)
 
 
 class Mistake(NamedTuple):
@@ -109,12 +117,6 @@ def test_states(y0, mistake, solver):
     mistake.check(error)
 
 
-@each(WAYS)
-def test_states_for_every_scheme(scheme: Scheme):
-    with pytest.raises(ValueError, match=re.escape(STATE)):
-        trace(TERM, scheme.solver, x)
-
-
 @pytest.mark.filterwarnings("ignore:Complex dtype support")
 def test_complex_states():
     y0 = (jnp.ones(2, complex), jnp.ones(2, complex))
@@ -135,21 +137,18 @@ def test_integer_states_are_for_diffeqsolve_to_convert(scheme: Scheme):
 # Terms
 
 ODE = dfx.ODETerm(lambda t, y, args: y)
-STEPPED = "Presymplectic solvers need a `HamiltonianTerm`"
-HAND_WRITTEN = "`VectorField(velocity, force)` for a hand-written"
+STEPPED = (
+    "Presymplectic solvers need a system such as `MechanicalSystem(kinetic, potential)`"
+)
+HAND_WRITTEN = "`MechanicalSystem(kinetic, ForceField(force))`"
 
 
-@each(WAYS)
-def test_terms_of_another_kind(scheme: Scheme):
+@pytest.mark.parametrize("term", [ODE, dfx.MultiTerm(ODE, ODE)])
+@each(CARRIES)
+def test_terms_of_another_kind(scheme: Scheme, term):
     with pytest.raises(ValueError) as error:
-        trace(ODE, scheme.solver)
-    Mistake("got `ODETerm`", STEPPED, HAND_WRITTEN).check(error)
-
-
-def test_several_terms_in_one():
-    with pytest.raises(ValueError) as error:
-        trace(dfx.MultiTerm(ODE, ODE), LEAPFROG)
-    Mistake("got `MultiTerm`", STEPPED, HAND_WRITTEN).check(error)
+        trace(term, scheme.solver)
+    Mistake(f"got `{type(term).__name__}`", STEPPED, HAND_WRITTEN).check(error)
 
 
 def test_the_terms_of_semi_implicit_euler():
@@ -160,40 +159,22 @@ def test_the_terms_of_semi_implicit_euler():
     Mistake("(ODETerm(", message, "expected:\ndiffrax.AbstractTerm").check(error)
 
 
-@pytest.mark.parametrize("given", [oscillator, harmonic, ODE])
-def test_terms_hold_a_hamiltonian(given):
-    with pytest.raises(ValueError) as error:
-        given
-    instead = "`MechanicalSystem(kinetic, potential)`"
-    Mistake(repr(given), "needs a Hamiltonian", instead).check(error)
-
-
-def test_backsolve_adjoint_with_the_same_solver():
-    def loss(y0):
-        t = (0.0, 1.0, 0.1)
-        adjoint = dfx.BacksolveAdjoint()
-        sol = dfx.diffeqsolve(TERM, LEAPFROG, *t, y0, adjoint=adjoint)
-        assert sol.ys is not None
-        return jnp.sum(sol.ys[0])
-
-    loss(PAIR)  # The solve itself succeeds.
-    with pytest.raises(ValueError) as error:
-        eqx.filter_eval_shape(jax.grad(loss), PAIR)
-    instead = "`BacksolveAdjoint(solver=diffrax.Tsit5())`"
-    Mistake("`BacksolveAdjoint()`", "not Hamiltonian", instead).check(error)
-
-
-def test_backsolve_adjoint_with_the_solver_it_is_told_to_use():
+@pytest.mark.slow
+def test_backsolve_adjoint():
     @eqx.filter_jit
     def gradient(adjoint):
         def loss(y0):
-            t0, t1, dt0 = jnp.array(0.0), jnp.array(1.0), jnp.array(0.01)
-            sol = dfx.diffeqsolve(TERM, LEAPFROG, t0, t1, dt0, y0, adjoint=adjoint)
+            t = map(jnp.array, (0.0, 1.0, 0.01))
+            sol = dfx.diffeqsolve(TERM, LEAPFROG, *t, y0, adjoint=adjoint)
             assert sol.ys is not None
             return jnp.sum(sol.ys[0] ** 2 + sol.ys[1])
 
         return jax.grad(loss)(PAIR)
 
+    with pytest.raises(ValueError) as error:
+        gradient(dfx.BacksolveAdjoint())
+    instead = "`BacksolveAdjoint(solver=diffrax.Tsit5())`"
+    Mistake("`BacksolveAdjoint()`", "not Hamiltonian", instead).check(error)
     backsolve = gradient(dfx.BacksolveAdjoint(solver=dfx.Tsit5()))
     # Up to the error of the leapfrog, as the adjoint equations are continuous.
     assert_close(backsolve, gradient(dfx.RecursiveCheckpointAdjoint()), 1e-4)
@@ -201,10 +182,7 @@ def test_backsolve_adjoint_with_the_solver_it_is_told_to_use():
 
 # Energies that a scheme does not support
 
-PARTS = (
-    "`MechanicalSystem(kinetic, potential)`",
-    "`ConformalHamiltonian(kinetic, potential, damping)`",
-)
+PARTS = "`MechanicalSystem(kinetic, potential)`"
 
 
 @pytest.mark.parametrize("hamiltonian", list(NONSEPARABLE.values()), ids=NONSEPARABLE)
@@ -215,12 +193,11 @@ def test_nonseparable_energies_need_a_root_finder(scheme: Scheme, hamiltonian):
     message = str(error.value)
     assert f"This `{type(hamiltonian).__name__}` is not separable" in message
     # All three alternatives.
-    assert "`root_finder=optimistix.Newton(rtol=1e-10, atol=1e-10)`" in message
-    assert "`PresymplecticCoupled()`" in message
-    assert all(parts in message for parts in PARTS)
+    newton = "`root_finder=optimistix.Newton(rtol=1e-10, atol=1e-10)`"
+    assert all(x in message for x in (newton, "`PresymplecticCoupled()`", PARTS))
 
 
-SPLIT = "a Hamiltonian split into a kinetic part and a potential"
+SPLIT = "a system split into a kinetic part and a potential"
 
 
 @pytest.mark.parametrize("hamiltonian", list(NONSEPARABLE.values()), ids=NONSEPARABLE)
@@ -232,8 +209,8 @@ def test_splittings_need_a_split_energy(solver, hamiltonian):
     with pytest.raises(ValueError) as error:
         trace(hamiltonian, solver)
     given = f"this `{type(hamiltonian).__name__}` is not"
-    Mistake(given, SPLIT, "`PresymplecticCoupled()`").check(error)
-    assert all(parts in str(error.value) for parts in PARTS)
+    Mistake(given, SPLIT, "`PresymplecticGauss()`").check(error)
+    assert PARTS in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -241,11 +218,8 @@ def test_splittings_need_a_split_energy(solver, hamiltonian):
     [
         dps.MechanicalSystem(dps.RelativisticKinetic(), harmonic),
         dps.MechanicalSystem(lambda t, p, args: jnp.sum(p**2) / 2, harmonic),
-        dps.MechanicalSystem(
-            dps.QuadraticKinetic(), dps.ForceField(lambda t, q, args: -q)
-        ),
     ],
-    ids=["relativistic", "a function", "no energy"],
+    ids=["relativistic", "a function"],
 )
 @pytest.mark.parametrize(
     "solver", [dps.BlanesMoanRKN4(), dps.BlanesMoanRKN6(), dps.BlanesCasasRKN8()]
@@ -303,10 +277,6 @@ SOLVERS = {
         lambda: dps.Composition(LEAPFROG, [0.5, 0.5 + 1e-9]),
         Mistake("sum to 1.000000001", SUM, "divide by their sum"),
     ),
-    "no weights": (
-        lambda: dps.Composition(LEAPFROG, []),
-        Mistake("sum to 0.0", SUM, "divide by their sum"),
-    ),
     "kicks of a tableau": (
         lambda: splitting(0.5, 1.0, 0.25),
         Mistake("2 kicks that sum to 0.75", TABLEAU, "divide each kind by its sum"),
@@ -335,21 +305,22 @@ SOLVERS = {
         Mistake(
             "got (0.5, 1.0, 0.5)",
             "needs a tableau",
-            "`Splitting(SplittingTableau(order, kick_first, quadratic, fractions))`",
+            "`Splitting(SplittingTableau(order, kick_first, kind, fractions))`",
         ),
     ),
-    "base of a triple jump": (
-        lambda: dps.SuzukiYoshida(4, base=dps.PresymplecticEuler()),
-        Mistake("`PresymplecticEuler`", SYMMETRIC, "Compose `PresymplecticLeapfrog()`"),
-    ),
-    "base of a tabulated composition": (
-        lambda: dps.Suzuki4(dps.PresymplecticEuler()),
-        Mistake("`PresymplecticEuler`", SYMMETRIC, "Compose `PresymplecticLeapfrog()`"),
-    ),
-    "base of weights": (
-        lambda: dps.Composition(dps.PresymplecticEuler(), [0.25, 0.5, 0.25]),
-        Mistake("`PresymplecticEuler`", SYMMETRIC, "Compose `PresymplecticLeapfrog()`"),
-    ),
+    **{
+        f"base of a composition {i}": (
+            compose,
+            Mistake("`PresymplecticEuler`", SYMMETRIC, "`PresymplecticLeapfrog()`"),
+        )
+        for i, compose in enumerate(
+            [
+                lambda: dps.SuzukiYoshida(4, base=dps.PresymplecticEuler()),
+                lambda: dps.Suzuki4(dps.PresymplecticEuler()),
+                lambda: dps.Composition(dps.PresymplecticEuler(), [0.25, 0.5, 0.25]),
+            ]
+        )
+    },
     "base is Diffrax's": (
         lambda: dps.Suzuki4(dfx.Tsit5()),  # type: ignore
         Mistake("got Tsit5()", BASE, "`PresymplecticLeapfrog()`"),
@@ -357,14 +328,6 @@ SOLVERS = {
     "base is a class": (
         lambda: dps.Substeps(dps.PresymplecticLeapfrog, 2),  # type: ignore
         Mistake("got <class ", BASE, "`PresymplecticLeapfrog()`"),
-    ),
-    "Tao in a composition": (
-        lambda: dps.SuzukiYoshida(4, base=dps.PresymplecticTao()),
-        Mistake("`PresymplecticTao` needs", FIXED, "`PresymplecticTao(coupling)`"),
-    ),
-    "Tao further in": (
-        lambda: dps.Suzuki4(dps.Substeps(dps.PresymplecticTao(), 2)),
-        Mistake("`PresymplecticTao` needs", FIXED, "`PresymplecticTao(coupling)`"),
     ),
     **{
         f"coupling {given}": (
@@ -433,7 +396,9 @@ def test_equal_weights_ask_nothing_of_the_base():
     dps.Composition(dps.PresymplecticEuler(), [0.5, 0.5])
 
 
-MATRIX_FRICTION = dps.MechanicalSystem(KINETIC, harmonic, dps.ViscousDamping(jnp.eye(2)))
+MATRIX_FRICTION = dps.MechanicalSystem(
+    KINETIC, harmonic, dps.ViscousDamping(jnp.eye(2))
+)
 
 
 @pytest.mark.parametrize(
@@ -458,9 +423,9 @@ POSITIVE = "must be positive"
 ONE_NUMBER = "must return a real scalar for the whole system"
 SUM_OVER = "`jnp.sum(...)`"
 MASS = "`QuadraticKinetic(mass)`"
-LAW = "must be a damping law or a function eta(t)"
+LAW = "must be a law of friction, a function eta(t) or a list of these"
 RATE = "`ConstantDamping(rate)`"
-ONE_DAMPING = "must be a scalar for the whole system"
+ONE_RATE = "Only one rate of damping for all momenta has a log scale"
 EITHER = "either `kinetic` and `potential`, or `energy`"
 VECTOR = jnp.array([0.1, 0.2])
 
@@ -563,51 +528,33 @@ HAMILTONIANS = {
         lambda: dps.Hamiltonian(3.0),
         Mistake("got 3.0", "`energy` must be a function", "`E(t, q, p, args)`"),
     ),
-    "force of a wrong shape": (
-        lambda: system(force=lambda t, q, args: jnp.ones(3)),
-        Mistake("returned shape (3,)", "arrays of the shapes of `q`", "of shape (2,)"),
-    ),
-    "force of a wrong structure": (
-        lambda: system(force=lambda t, q, args: (q, q)),
-        Mistake("returned PyTreeDef((*, *))", "the same structure as `q`", "`force`"),
-    ),
-    "complex force": (
-        lambda: system(force=lambda t, q, args: q * jnp.array(1j)),
-        Mistake("`force` must return real", "returned complex128[2]", "`jnp.real`"),
-    ),
-    "velocity of a wrong structure": (
-        lambda: system(velocity=lambda t, p, args: {"v": p}),
-        Mistake("returned PyTreeDef({'v': *})", "structure as `p`", "`velocity`"),
-    ),
-    **{
-        f"{name} of an energy that is not separable": (
-            lambda name=name: trace(
-                dps.Hamiltonian(
-                        mixed_energy, **{name: lambda t, q, p, args: jnp.ones(3)}
-                    ),
-                dps.PresymplecticTao(),
-            ),
-            Mistake("returned shape (3,)", f"`{name}` must return", "of shape (2,)"),
-        )
-        for name in ("velocity", "force")
-    },
-    "force of a hand-written field": (
+    "force of an energy that is not separable": (
         lambda: trace(
-            dps.MechanicalSystem(
-                dps.QuadraticKinetic(), dps.ForceField(lambda t, q, a: jnp.ones(3))
-            ),
-            LEAPFROG,
+            dps.Hamiltonian(mixed_energy, force=lambda t, q, v, args: jnp.ones(3)),
+            dps.PresymplecticTao(),
         ),
+        Mistake("returned shape (3,)", "`force` must return", "of shape (2,)"),
+    ),
+    "force of a hand-written field": (
+        lambda: system(potential=dps.ForceField(lambda t, q, args: jnp.ones(3))),
         Mistake("returned shape (3,)", "`force` must return", "of shape (2,)"),
     ),
     "damping by a number": (
         lambda: dps.ConformalHamiltonian(KINETIC, harmonic, 0.2),
         Mistake("got 0.2", LAW, RATE),
     ),
-    "damping by coefficients": (
-        lambda: dps.ConformalHamiltonian(KINETIC, harmonic, dps.ViscousDamping(1.0)),
-        Mistake("got ViscousDamping", LAW, "`MechanicalSystem(kinetic, potential,"),
-    ),
+    **{
+        f"damping of the paper's family, {name}": (
+            lambda law=law: dps.ConformalHamiltonian(KINETIC, harmonic, law),
+            Mistake("has other friction", ONE_RATE, RATE),
+        )
+        for name, law in {
+            "coefficients": dps.ViscousDamping(1.0),
+            "numbers": dps.ConstantDamping(VECTOR),
+            "a function of several numbers": lambda t: VECTOR * t,
+            "drag": dps.Drag(1.0),
+        }.items()
+    },
     "damping of the general family by a number": (
         lambda: dps.DissipativeHamiltonian(KINETIC, harmonic, DAMPING, 0.2),
         Mistake("got 0.2", f"`eta2` {LAW}", RATE),
@@ -624,20 +571,12 @@ HAMILTONIANS = {
         lambda: dps.ConformalHamiltonian(KINETIC, damping=DAMPING),
         Mistake("needs", EITHER, "`ConformalHamiltonian(energy=energy, damping=damp"),
     ),
-    "energy and damping by position": (
-        lambda: dps.ConformalHamiltonian(mixed_energy, DAMPING),
-        Mistake(
-            "got ConstantDamping(",
-            "`potential` must be a function `V(t, q, args)`",
-            "`ConformalHamiltonian(energy=energy, damping=damping)`",
-        ),
-    ),
     "potential before kinetic energy": (
         lambda: dps.MechanicalSystem(harmonic, KINETIC),
         Mistake(
             "got QuadraticKinetic(",
             "`potential` must be a function `V(t, q, args)`",
-            "The order is `(kinetic, potential, damping)`",
+            "The order is `(kinetic, potential, friction)`",
         ),
     ),
     "kinetic energy of `p` alone said to depend on `q`": (
@@ -649,12 +588,6 @@ HAMILTONIANS = {
             "`DissipativeHamiltonian(..., separable=False)` needs",
             "a function `T(t, q, P, args)`",
         ),
-    ),
-    "potential of the general family is no function": (
-        lambda: dps.DissipativeHamiltonian(
-            lambda t, q, P, args: jnp.sum(P**2), 3.0, DAMPING, DAMPING, separable=False
-        ),
-        Mistake("got 3.0", "`potential` must be a function", "`V(t, q, args)`"),
     ),
     "both energies": (
         lambda: dps.ConformalHamiltonian(KINETIC, harmonic, energy=mixed_energy),
@@ -668,17 +601,6 @@ def test_hamiltonians(act, mistake):
     with pytest.raises(ValueError) as error:
         act()
     mistake.check(error)
-
-
-@pytest.mark.parametrize("law", [dps.ConstantDamping(VECTOR), lambda t: VECTOR * t])
-@pytest.mark.parametrize(
-    "solver", [LEAPFROG, dps.PresymplecticTao(), dps.BlanesMoan4(), dfx.Tsit5()]
-)
-def test_one_damping_for_all_momenta(law, solver):
-    hamiltonian = dps.ConformalHamiltonian(KINETIC, harmonic, law)
-    with pytest.raises(ValueError) as error:
-        trace(hamiltonian, solver)
-    Mistake("has shape (2,)", ONE_DAMPING, "`jax.vmap`").check(error)
 
 
 def test_masses_not_yet_known_are_not_judged():

@@ -93,7 +93,9 @@ SYSTEMS = {
         dps.QuadraticKinetic(jnp.diag(jnp.array([1.0, 2.0]))), harmonic, DAMPING
     ),
     "mixed": dps.ConformalHamiltonian(
-        dps.QuadraticKinetic(TWO), harmonic, [dps.LogDamping(ONE), dps.PowerDamping(ONE, HALF)]
+        dps.QuadraticKinetic(TWO),
+        harmonic,
+        [dps.LogDamping(ONE), dps.PowerDamping(ONE, HALF)],
     ),
     "callable": dps.ConformalHamiltonian(
         dps.QuadraticKinetic(TWO), harmonic, lambda t: jnp.sin(t)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
-from helpers import assert_close, drift, flat, harmonic, solve
+from helpers import drift, flat, harmonic, solve
 
 import diffrax_presym as dps
 

@@ -1,7 +1,6 @@
 """Friction of every kind: by degree of freedom, matrix, place and speed."""
 
 import functools
-import math
 from typing import Any
 
 import diffrax as dfx
@@ -10,11 +9,9 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
-import optimistix as optx
 import pytest
 import scipy.integrate
 import scipy.linalg
-import scipy.optimize
 from helpers import assert_close, flat, harmonic, solve, step
 
 import diffrax_presym as dps
@@ -34,7 +31,7 @@ MASS = jnp.array([[2.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 1.5]])
 C = jnp.array([[0.3, 0.5, -0.2], [-0.3, 0.2, 0.1], [0.1, -0.4, 0.25]])
 STIFFNESS = jnp.array([[2.0, -1.0, 0.0], [-1.0, 2.0, -1.0], [0.0, -1.0, 2.0]])
 Y0 = (jnp.array([0.8, -0.5, 0.3]), jnp.array([0.2, 0.6, -0.4]))
-DENSE = dps.QuadraticKinetic(MASS)
+DENSE, KINETIC = dps.QuadraticKinetic(MASS), dps.QuadraticKinetic()
 
 
 def saved(sol) -> Any:
@@ -52,15 +49,20 @@ def layer(t, q, args):
     return 0.5 * jnp.exp(-(q**2))
 
 
+def by_place(t, q, args):
+    return 0.3 * jnp.exp(-(q[:1] ** 2))
+
+
+def gust(t, q, args):
+    return jnp.stack([jnp.sin(t), q[0], 1 + 0 * t])
+
+
 LINEAR = {
-    "by degree of freedom": dps.ConstantDamping(jnp.array([0.1, 0.5, -0.2])),
-    "and time": dps.LogDamping(jnp.array([3.0, 1.0, 0.5]), shift=1.0),
+    "by degree of freedom and time": dps.LogDamping(jnp.array([3.0, 1, 0.5]), 1.0),
     "two laws": [dps.ConstantDamping(0.1), lambda t: jnp.sin(t) / 5],
     "viscous number": dps.ViscousDamping(0.3),
     "matrix": dps.ViscousDamping(C),
     "matrix and time": dps.ViscousDamping(C, dps.LogDamping(1.0, shift=1.0)),
-    "rayleigh": dps.RayleighDamping(0.1, 0.1, STIFFNESS),
-    "operator": dps.ViscousDamping(lx.MatrixLinearOperator(C) * 2.0),
     "products": dps.ViscousDamping(
         lx.FunctionLinearOperator(lambda v: C @ v, jax.eval_shape(lambda: Y0[1]))
     ),
@@ -70,118 +72,77 @@ LINEAR = {
         dps.ConstantDamping(0.1),
     ],
 }
+WIND = jnp.array([1.0, -0.5, 0.2])
 LOCAL = {
     "place": dps.PositionDamping(layer),
     "place, matrix": dps.ViscousDamping(lambda t, q, args: C * (1 + q[0] ** 2)),
-    "place and matrix": [dps.ViscousDamping(C), dps.PositionDamping(layer)],
-}
-DRAG = {
-    "drag": dps.Drag(0.3),
-    "drag 1.5": dps.Drag(0.3, 1.5),
-    "drag and matrix": [dps.Drag(0.3), dps.ViscousDamping(C)],
-    "two drags": [dps.Drag(0.3, 1.0), dps.Drag(0.2, 3.0)],
-    "drag by place": dps.Drag(lambda t, q, args: jnp.exp(-(q[:1] ** 2))),
+    "two drags": [dps.Drag(0.3, 1.5), dps.Drag(0.2, 3.0)],
+    "wind": dps.Drag(0.3, medium=WIND),
+    "gust": dps.Drag(0.3, medium=gust),
     "all by place": [
-        dps.Drag(lambda t, q, args: 0.3 * jnp.exp(-(q[:1] ** 2))),
+        dps.Drag(by_place, 1.5, medium=WIND),
         dps.PositionDamping(layer),
         dps.ViscousDamping(C),
     ],
 }
-ALL = LINEAR | LOCAL | DRAG
+# Of bodies of the mass 2, a drag `c(q) |v - w(t, q)|^(k - 1) (v - w(t, q))` for each
+# triple; and the friction on the velocity by a matrix.
+DRAGS: dict[str, tuple] = {
+    "two drags": [
+        (lambda q: 0.3, lambda t, q: 0.0, 1.5),
+        (lambda q: 0.2, lambda t, q: 0.0, 3),
+    ],
+    "wind": [(lambda q: 0.3, lambda t, q: np.array(WIND), 2)],
+    "gust": [(lambda q: 0.3, lambda t, q: np.array([np.sin(t), q[0], 1]), 2)],
+    "all by place": [(lambda q: 0.3 * np.exp(-(q[0] ** 2)), lambda t, q: WIND, 1.5)],
+}
 
 
 @functools.cache
 def system(name):
-    kinetic = dps.QuadraticKinetic(2.0) if name in DRAG else DENSE
-    return dps.MechanicalSystem(kinetic, driven, ALL[name])
+    kinetic = dps.QuadraticKinetic(2.0) if name in DRAGS else DENSE
+    return dps.MechanicalSystem(kinetic, driven, (LINEAR | LOCAL)[name])
 
 
-def reference_system(name):
-    """The same equations by hand."""
-    mass = 2 * np.eye(3) if name in DRAG else np.array(MASS)
-    c, gradient = np.array(C), jax.jit(jax.grad(driven, argnums=1))
-    drag = lambda c, k: lambda t, q, v: c(q) * np.linalg.norm(v) ** (k - 1) * v
-    by_place = lambda q: np.exp(-(q**2))
-    constant = lambda matrix: lambda t, q, v: matrix @ v
-    rate = lambda rate: lambda t, q, v: rate(t, q) * (mass @ v)
-    friction = {
-        "by degree of freedom": [rate(lambda t, q: np.array([0.1, 0.5, -0.2]))],
-        "and time": [rate(lambda t, q: np.array([3.0, 1.0, 0.5]) / (t + 1))],
-        "two laws": [rate(lambda t, q: 0.1 + np.cos(t) / 5)],
-        "viscous number": [constant(0.3 * np.eye(3))],
-        "matrix": [constant(c)],
-        "matrix and time": [lambda t, q, v: c @ v / (t + 1)],
-        "rayleigh": [constant(0.1 * mass + 0.1 * np.array(STIFFNESS))],
-        "operator": [constant(2 * c)],
-        "products": [constant(c)],
-        "sum": [constant(c + 0.2 * mass + 0.1 * np.array(STIFFNESS))],
-        "place": [rate(lambda t, q: 0.5 * by_place(q))],
-        "place, matrix": [lambda t, q, v: (1 + q[0] ** 2) * c @ v],
-        "place and matrix": [constant(c), rate(lambda t, q: 0.5 * by_place(q))],
-        "drag": [drag(lambda q: 0.3, 2)],
-        "drag 1.5": [drag(lambda q: 0.3, 1.5)],
-        "drag and matrix": [drag(lambda q: 0.3, 2), constant(c)],
-        "two drags": [drag(lambda q: 0.3, 1), drag(lambda q: 0.2, 3)],
-        "drag by place": [drag(lambda q: by_place(q[0]), 2)],
-        "all by place": [
-            drag(lambda q: 0.3 * by_place(q[0]), 2),
-            rate(lambda t, q: 0.5 * by_place(q)),
-            constant(c),
-        ],
-    }[name]
+def force_by_hand(name, t, q, v):
+    """The friction of bodies, in NumPy."""
+    force = np.zeros(3)
+    for c, w, k in DRAGS[name]:
+        relative = v - np.asarray(w(t, q))
+        force -= c(q) * np.linalg.norm(relative) ** (k - 1) * relative
+    if name == "all by place":
+        force -= 0.5 * np.exp(-(q**2)) * 2 * v + np.array(C) @ v
+    return force
+
+
+@pytest.mark.parametrize("name", DRAGS)
+@pytest.mark.slow
+def test_order_with_drag(name):
+    slope = jax.jit(jax.grad(driven, argnums=1))
 
     def rhs(t, y):
-        q, v = y[:3], np.linalg.solve(mass, y[3:])
-        force = -np.asarray(gradient(t, q, None))
-        return np.concatenate([v, force - sum(f(t, q, v) for f in friction)])
+        q, v = y[:3], y[3:] / 2
+        return np.concatenate([v, force_by_hand(name, t, q, v) - slope(t, q, None)])
 
-    return rhs
-
-
-@functools.cache
-def truth(name):
-    times, start = (0, 2), np.concatenate(Y0)
-    rhs = reference_system(name)
-    sol = scipy.integrate.solve_ivp(rhs, times, start, "DOP853", rtol=3e-14, atol=1e-15)
-    return sol.y[:, -1]
+    start = np.concatenate(Y0)
+    options: Any = dict(rtol=3e-14, atol=1e-15)
+    end = scipy.integrate.solve_ivp(rhs, (0, 2), start, "DOP853", **options).y[:, -1]
+    steps = np.array([10, 14, 20])
+    ends = [solve(system(name), dps.BlanesMoan6(), 0.0, 2.0, 2 / n, Y0) for n in steps]
+    errors = [np.max(np.abs(flat(sol.ys) - end)) for sol in ends]
+    assert errors[-1] < 1e-6
+    assert abs(-np.polyfit(np.log(steps), np.log(errors), 1)[0] - 6) < 0.3
 
 
-def schemes(name):
-    nystrom = dps.PresymplecticLeapfrog(), dps.BlanesMoanRKN4(), dps.TunedRKN6()
-    general = dps.Strang(), dps.BlanesMoan4(), dps.BlanesMoan6()
-    return nystrom if name in LINEAR else general
+@pytest.mark.parametrize("name", DRAGS)
+def test_friction_of_bodies(name):
+    q, p = Y0
+    found = system(name).friction_force(jnp.array(0.3), q, p)
+    assert_close(found, jnp.asarray(force_by_hand(name, 0.3, q, p / 2)), 1e-15)
 
 
-# The most general of each kind with the scheme that has the most to lose.
-HARD = "matrix", "and time", "place and matrix", "drag", "all by place"
-ORDERS = [
-    pytest.param(
-        *(name, solver),
-        marks=[] if name in HARD and solver.order(None) == 6 else pytest.mark.slow,
-        id=f"{name}, {type(solver).__name__}",
-    )
-    for name in ALL
-    for solver in schemes(name)
-]
-
-
-@pytest.mark.parametrize("name, solver", ORDERS)
-def test_order(name, solver):
-    order = solver.order(None)
-    steps = np.array([10, 14, 20] if order == 6 else [32, 48, 64])
-
-    def error(n):
-        sol = solve(system(name), solver, 0.0, 2.0, 2 / n, Y0)
-        return np.max(np.abs(flat(sol.ys) - truth(name)))
-
-    errors = np.array([error(n) for n in steps])
-    assert errors[-1] < (2e-3 if order == 2 else 1e-6)
-    measured = -np.polyfit(np.log(steps), np.log(errors), 1)[0]
-    assert abs(measured - order) < 0.25
-
-
-@pytest.mark.parametrize("name", [*LOCAL, *DRAG])
-def test_schemes_that_would_lose_their_order_refuse(name):
+@pytest.mark.parametrize("name", ["place", "two drags", "gust"])
+def test_schemes_that_would_lose_their_order_name_those_that_do_not(name):
     for solver in (dps.TunedRKN6(), dps.BlanesMoanRKN4(), dps.BlanesCasasRKN8()):
         with pytest.raises(ValueError, match=r"BlanesMoan4.*BlanesMoan6"):
             step(system(name), solver, 0.0, 0.1, Y0)
@@ -189,46 +150,33 @@ def test_schemes_that_would_lose_their_order_refuse(name):
         step(system(name), dps.PresymplecticLeapfrog(), 0.0, 0.1, Y0)
 
 
-def test_long_steps_refuse_friction_other_than_one_rate():
-    with pytest.raises(ValueError, match="TunedRKN6"):
-        step(system("matrix"), dps.TunedLinear8(), 0.0, 0.1, Y0)
-    one = dps.MechanicalSystem(DENSE, driven, dps.ConstantDamping(0.2))
-    same = dps.ConformalHamiltonian(DENSE, driven, dps.ConstantDamping(0.2))
-    for solver in (dps.TunedLinear8(), dps.TunedRKN6()):
-        found, wanted = (step(x, solver, 0.0, 0.1, Y0)[0] for x in (one, same))
-        assert_close(found, wanted, 1e-15)
-
-
 # Structure.
 
 
 @pytest.mark.parametrize("name", LINEAR)
 def test_phase_volume_contracts_by_the_trace(name):
-    solvers = dps.PresymplecticLeapfrog(), dps.TunedRKN6()
-    for solver in solvers if name in HARD else solvers[:1]:
-        term = system(name)
-        assert abs(volume_defect(term, solver, 0.3, 0.5, Y0)) < 1e-13
+    solver = dps.TunedRKN6() if name == "matrix" else dps.PresymplecticLeapfrog()
+    assert abs(volume_defect(system(name), solver, 0.3, 0.5, Y0)) < 1e-13
 
 
 def test_the_trace_by_hand():
-    term = system("matrix")
     end = lambda q, p: step(system("matrix"), dps.TunedRKN6(), 0.3, 0.5, (q, p))[0]
     jacobian = jax.jacfwd(end, argnums=(0, 1))(*Y0)
     matrix = np.block([[np.array(x) for x in row] for row in jacobian])
     trace = np.trace(np.array(C) @ np.linalg.inv(np.array(MASS)))
     np.testing.assert_allclose(np.linalg.det(matrix), np.exp(-0.2 * trace), 1e-13)
     with pytest.raises(ValueError, match="volume_defect"):
-        structure_defect(term, dps.TunedRKN6(), 0.0, 0.1, Y0)
+        structure_defect(system("matrix"), dps.TunedRKN6(), 0.0, 0.1, Y0)
     with pytest.raises(ValueError, match="depends on the trajectory"):
-        place = system("place")
-        volume_defect(place, dps.BlanesMoan4(), 0.0, 0.1, Y0)
+        volume_defect(system("place"), dps.BlanesMoan4(), 0.0, 0.1, Y0)
 
 
 def test_a_kick_with_friction_by_place_contracts_by_the_friction_there():
     q, p = Y0
-    local: Any = system("place, matrix")
-    values, force = local.local_values(0.0, q, None), jnp.ones(3)
-    change = lambda p: p + local.kick(0.0, 0.3, p, force, values, 6)
+    local, force = system("place, matrix"), jnp.ones(3)
+    numbers = local.local_friction(jnp.array(0.0), q, p, None)
+    h = jnp.array(0.3)
+    change = lambda p: p + local.local_kick(0 * h, h, p, force, numbers, 6)
     gamma = (1 + q[0] ** 2) * C @ jnp.linalg.inv(MASS)
     found = np.linalg.slogdet(jax.jacfwd(change)(p))[1]
     np.testing.assert_allclose(found, -0.3 * jnp.trace(gamma), 1e-13)
@@ -238,29 +186,33 @@ def test_a_kick_with_friction_by_place_contracts_by_the_friction_there():
     np.testing.assert_allclose(change(p), left @ p + gained, 1e-12)
 
 
+@pytest.mark.parametrize("name", ["matrix", "wind"])
+def test_a_step_backwards_undoes_a_step(name):
+    solver = dps.BlanesMoan6() if name in DRAGS else dps.TunedRKN6()
+    there = step(system(name), solver, 0.0, 0.2, Y0)[0]
+    assert_close(step(system(name), solver, 0.2, 0.0, there)[0], Y0, 1e-13)
+
+
 FIELD = jnp.array([[0.0, -0.7, 0.2], [0.7, 0.0, 1.1], [-0.2, -1.1, 0.0]])
 
 
 @pytest.mark.parametrize("steps", [2000, pytest.param(10**6, marks=pytest.mark.slow)])
 def test_energy_in_a_magnetic_field_does_not_drift(steps):
-    field = dps.MechanicalSystem(
-        dps.QuadraticKinetic(2.0), harmonic, dps.ViscousDamping(FIELD)
-    )
-    term, h = field, 0.3
+    friction, h = dps.ViscousDamping(FIELD), 0.3
+    field = dps.MechanicalSystem(dps.QuadraticKinetic(2.0), harmonic, friction)
 
     @jax.jit
     def end(y):
         sol = dfx.diffeqsolve(
-            *(term, dps.TunedRKN6(), 0.0, steps * h, h, y),
+            *(field, dps.TunedRKN6(), 0.0, steps * h, h, y),
             max_steps=None,
             saveat=dfx.SaveAt(ts=jnp.linspace(0, steps * h, 6)[1:]),
             adjoint=dps.FixedStepAdjoint(),
         )
-        return energy(term, *saved(sol))
+        return energy(field, *saved(sol))
 
-    start = field.energy(0.0, *Y0)
     # The scheme makes an error that oscillates; rounding would accumulate.
-    errors = np.asarray(end(Y0) / start - 1)
+    errors = np.asarray(end(Y0) / field.energy(0.0, *Y0) - 1)
     assert np.max(np.abs(errors)) < 1e-9
 
 
@@ -280,12 +232,9 @@ def test_friction_of_the_canonical_momentum_is_not_that_of_the_velocity():
     # |p - A(q)|^2 / 2 with a damping law damps p, not the velocity p - A.
     A = lambda q: FIELD @ q / 2
     canonical = lambda t, q, p, args: jnp.sum((p - A(q)) ** 2) / 2
-    trap = dps.ConformalHamiltonian(energy=canonical, damping=dps.ConstantDamping(0.3))
-    right = dps.MechanicalSystem(
-        dps.QuadraticKinetic(),
-        lambda t, q, args: 0.0 * jnp.sum(q),
-        [dps.ViscousDamping(FIELD), dps.ViscousDamping(0.3)],
-    )
+    trap = dps.Hamiltonian(canonical, dps.ConstantDamping(0.3))
+    laws = [dps.ViscousDamping(FIELD), dps.ViscousDamping(0.3)]
+    right = dps.MechanicalSystem(KINETIC, lambda t, q, args: 0.0 * jnp.sum(q), laws)
     q, v = Y0
     rates = trap.vf(0.0, (q, v + A(q)), None)
     _, slope = jax.jvp(A, (q,), (v,))
@@ -316,26 +265,21 @@ def test_exponentials(scale):
             assert_close(products, (change @ Y0[0], integral @ Y0[0]), 1e-15)
 
 
-TREES = {
-    "constant": (dps.ConstantDamping, (0.7,)),
-    "logarithmic": (dps.LogDamping, (3.0, 0.5)),
-}
-
-
 @pytest.mark.parametrize("exponent", [1.0, 1.5, 2.0, 3.0])
-@pytest.mark.parametrize("h", [0.7, -0.2])
-def test_the_flow_of_drag(exponent, h):
-    drag, p, mass = dps.Drag(0.4, exponent), jnp.array([[1.0, -2.0], [0.3, 0.1]]), 1.5
+@pytest.mark.parametrize("h, medium", [(0.7, None), (-0.2, jnp.array([0.5, -1.0]))])
+def test_the_flow_of_drag(exponent, h, medium):
+    drag, mass = dps.Drag(0.4, exponent, medium), 1.5
+    p, wind = jnp.array([[1.0, -2.0], [0.3, 0.1]]), 0.0 if medium is None else medium
 
     def rhs(t, x):
         v = x[4:].reshape(2, 2) / mass
-        speed = np.linalg.norm(v, axis=1, keepdims=True)
-        return np.concatenate([v.ravel(), (-0.4 * speed ** (exponent - 1) * v).ravel()])
+        speed = np.linalg.norm(v - wind, axis=1, keepdims=True)
+        force = -0.4 * speed ** (exponent - 1) * (v - wind)
+        return np.concatenate([v.ravel(), np.ravel(force)])
 
     start = np.concatenate([np.zeros(4), np.ravel(p)])
-    end = scipy.integrate.solve_ivp(
-        rhs, (0, h), start, "DOP853", rtol=1e-12, atol=1e-13
-    ).y[:, -1]
+    options: Any = dict(rtol=1e-12, atol=1e-13)
+    end = scipy.integrate.solve_ivp(rhs, (0, h), start, "DOP853", **options).y[:, -1]
     moved, change = drag.flow(jnp.asarray(h), p, jnp.asarray(mass))
     np.testing.assert_allclose(np.ravel(moved), end[:4], 1e-9)
     np.testing.assert_allclose(np.ravel(p + change), end[4:], 1e-9)
@@ -373,230 +317,46 @@ def test_bodies_at_rest_have_gradients(exponent):
 
 def test_drag_backwards_beyond_its_start_fails():
     # Backwards in time the speed becomes infinite.
-    fast = dps.MechanicalSystem(dps.QuadraticKinetic(), harmonic, dps.Drag(5.0))
+    fast = dps.MechanicalSystem(KINETIC, harmonic, dps.Drag(5.0))
     y0 = jnp.zeros(2), jnp.array([30.0, 0.0])
     sol = solve(fast, dps.Strang(), 0.0, -0.5, -0.1, y0, throw=False)
     assert sol.result != dfx.RESULTS.successful
 
 
-# Gradients.
-
-GRADIENTS = {
-    "matrix": lambda c: dps.ViscousDamping(c),
-    "equal eigenvalues": lambda c: dps.ViscousDamping(0.3 * jnp.eye(3) + 0 * C + c - C),
-    "by degree of freedom": lambda c: dps.ConstantDamping(c[0]),
-    "matrix and time": lambda c: dps.ViscousDamping(c, dps.LogDamping(1.0, shift=1.0)),
-    "rayleigh": lambda c: dps.RayleighDamping(c[0, 0], c[0, 1], STIFFNESS),
-    "place": lambda c: dps.PositionDamping(lambda t, q, args: c[0] * q**2),
-    "drag": lambda c: dps.Drag(c[0, 0], 1.7 + c[0, 1]),
-}
-FEW = ("by degree of freedom",)
+# The numbers of the friction.
 
 
-def make_loss(name):
-    solver = dps.BlanesMoan6() if name in ("place", "drag") else dps.TunedRKN6()
-    mass = 2.0 if name == "drag" else MASS
-
-    def loss(c, adjoint):
-        friction = GRADIENTS[name](c)
-        law = dps.MechanicalSystem(dps.QuadraticKinetic(mass), driven, friction)
-        # The step does not divide the span.
-        sol = dfx.diffeqsolve(
-            *(law, solver, 0.0, 0.95, 0.1, Y0), adjoint=adjoint
-        )
-        return jnp.sum(jnp.sin(flat(sol.ys)))
-
-    return loss
+def test_the_leaves_of_a_system_are_its_parameters_each_once():
+    leaves = jax.tree.leaves(eqx.filter(system("matrix"), eqx.is_array))
+    assert len(leaves) == 2
 
 
-@pytest.mark.parametrize(
-    "name",
-    [x if x in FEW else pytest.param(x, marks=pytest.mark.slow) for x in GRADIENTS],
-)
-def test_gradients_with_respect_to_coefficients(name):
-    loss = make_loss(name)
-    reverse = jax.jit(jax.grad(lambda c: loss(c, dps.FixedStepAdjoint())))(C)
-    stored = jax.jit(jax.grad(lambda c: loss(c, dfx.RecursiveCheckpointAdjoint())))(C)
-    np.testing.assert_allclose(reverse, stored, rtol=0, atol=1e-12)
-    direction = jnp.sin(1.0 + jnp.arange(9.0)).reshape(3, 3)
-    value = jax.jit(lambda c: loss(c, dfx.ForwardMode()))
-    _, forward = jax.jvp(value, (C,), (direction,))
-    along = np.sum(stored * direction)
-    np.testing.assert_allclose(forward, along, rtol=1e-11, atol=1e-13)
-    d = 1e-5
-    central = (value(C + d * direction) - value(C - d * direction)) / (2 * d)
-    np.testing.assert_allclose(central, along, rtol=1e-6, atol=1e-9)
+@eqx.filter_jit
+def end_of(c, solver, adjoint):
+    model = dps.MechanicalSystem(DENSE, driven, dps.ViscousDamping(c))
+    return flat(dfx.diffeqsolve(model, solver, 0.0, 0.5, 0.1, Y0, adjoint=adjoint).ys)
 
 
-@pytest.mark.slow
-def test_gradients_with_respect_to_the_system():
-    # The leaves of a system are its parameters, each once.
-    model = dps.MechanicalSystem(DENSE, driven, dps.ViscousDamping(C))
-    assert len(jax.tree.leaves(eqx.filter(model, eqx.is_array))) == 2
-
-    def loss(model):
-        sol = dfx.diffeqsolve(
-            *(
-                model,
-                dps.PresymplecticLeapfrog(),
-                0.0,
-                0.5,
-                0.1,
-                Y0,
-            )
-        )
-        return jnp.sum(jnp.sin(flat(sol.ys)))
-
-    gradient = eqx.filter_jit(eqx.filter_grad(loss))(model)
-    found = jnp.sum(gradient.laws[0].coefficients)
-    where = lambda x: x.laws[0].coefficients
-    move = lambda d: loss(eqx.tree_at(where, model, C + d))
-    np.testing.assert_allclose(found, (move(1e-5) - move(-1e-5)) / 2e-5, 1e-6)
-
-
-# With all else.
-
-
-def test_saved_times_and_steps_of_other_lengths():
-    ts = jnp.array([0.03, 0.31, 0.5, 0.95])
-    term, solver = system("matrix"), dps.TunedRKN6()
-    fine = scipy.integrate.solve_ivp(
-        *(reference_system("matrix"), (0, 0.95), np.concatenate(Y0), "DOP853"),
-        t_eval=np.array(ts),
-        rtol=3e-14,
-        atol=1e-15,
-    ).y.T
-    ways = [
-        dict(dt0=0.07, adjoint=dps.FixedStepAdjoint()),
-        dict(dt0=0.07),
-        dict(
-            dt0=None,
-            stepsize_controller=dfx.StepTo(
-                jnp.array([0.0, 0.03, 0.2, 0.31, 0.5, 0.6, 0.75, 0.95])
-            ),
-        ),
-    ]
-    for way in ways:
-        sol = dfx.diffeqsolve(
-            *(term, solver, 0.0, 0.95), y0=Y0, saveat=dfx.SaveAt(ts=ts), **way
-        )
-        found = np.concatenate(saved(sol)[1], axis=1)
-        np.testing.assert_allclose(found, fine, rtol=0, atol=2e-9)
-
-
-@pytest.mark.slow
-def test_a_solve_can_be_continued():
-    solver, term = dps.TunedRKN6(), system("matrix")
-    whole = solve(system("matrix"), solver, 0.0, 1.0, 0.1, Y0)
-    for adjoint in (dfx.RecursiveCheckpointAdjoint(), dps.FixedStepAdjoint()):
-        saveat = dfx.SaveAt(t1=True, solver_state=True)
-        half = dfx.diffeqsolve(
-            *(term, solver, 0.0, 0.5, 0.1, Y0), saveat=saveat, adjoint=adjoint
-        )
-        y = jax.tree.map(lambda x: x[-1], half.ys)
-        rest = dfx.diffeqsolve(
-            *(term, solver, 0.5, 1.0, 0.1, y),
-            solver_state=half.solver_state,
-            made_jump=False,
-            adjoint=adjoint,
-        )
-        assert_close(rest.ys, whole.ys, 1e-14)
-
-
-@pytest.mark.parametrize("name", ["matrix", "drag"])
-def test_backwards_in_time(name):
-    solver = schemes(name)[2]
-    there = step(system(name), solver, 0.0, 0.2, Y0)[0]
-    back = step(system(name), solver, 0.2, 0.0, there)[0]
-    assert_close(back, Y0, 1e-13)
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param("matrix", marks=pytest.mark.slow),
-        pytest.param("place and matrix", marks=pytest.mark.slow),
-        "drag",
-    ],
-)
-def test_wrappers(name):
-    solver = schemes(name)[1]
-    plain = solve(system(name), solver, 0.0, 1.0, 0.1, Y0).ys
-    for wrapper in (dps.Compensated(solver), dps.Substeps(solver, 1)):
-        assert_close(solve(system(name), wrapper, 0.0, 1.0, 0.1, Y0).ys, plain, 1e-13)
-    halves = solve(system(name), dps.Substeps(solver, 2), 0.0, 1.0, 0.2, Y0).ys
-    assert_close(halves, plain, 1e-13)
-
-
-@pytest.mark.slow
-def test_step_densities():
-    term = system("matrix")
-    density = lambda t, y, args: 1 / (1 + y[0][0] ** 2)
-    controller = dps.StepDensityController(term, 0.05, density)
-    sol = dfx.diffeqsolve(
-        *(term, dps.TunedRKN6(), 0.0, 2.0, None, Y0), stepsize_controller=controller
-    )
-    np.testing.assert_allclose(flat(sol.ys), truth("matrix"), atol=1e-8)
+def test_gradients_at_equal_eigenvalues():
+    # And by reversal as by Diffrax.
+    at, direction = 0.3 * jnp.eye(3), jnp.sin(1 + jnp.arange(9.0)).reshape(3, 3)
+    value = lambda c, adjoint: jnp.sum(jnp.sin(end_of(c, dps.TunedRKN6(), adjoint)))
+    adjoints = dps.FixedStepAdjoint(), dfx.RecursiveCheckpointAdjoint()
+    first, second = (jax.grad(value)(at, adjoint) for adjoint in adjoints)
+    np.testing.assert_allclose(first, second, rtol=0, atol=1e-12)
+    d = 1e-5 * direction
+    central = (value(at + d, adjoints[0]) - value(at - d, adjoints[0])) / 2e-5
+    np.testing.assert_allclose(central, np.sum(first * direction), rtol=1e-6)
 
 
 def test_vmap_over_coefficients():
-    def end(c):
-        model = dps.MechanicalSystem(DENSE, driven, dps.ViscousDamping(c))
-        sol = dfx.diffeqsolve(
-            *(model, dps.BlanesMoanRKN4(), 0.0, 0.5, 0.1, Y0)
-        )
-        return flat(sol.ys)
-
+    one = lambda c: end_of(c, dps.BlanesMoanRKN4(), dfx.RecursiveCheckpointAdjoint())
     many = jnp.stack([C, 2 * C, C.T])
-    batch = jax.jit(jax.vmap(end))(many)
-    one = jax.jit(end)
-    np.testing.assert_allclose(batch, jnp.stack([one(c) for c in many]), atol=1e-14)
+    wanted = jnp.stack([one(c) for c in many])
+    np.testing.assert_allclose(jax.vmap(one)(many), wanted, atol=1e-14)
 
 
 @pytest.mark.slow
-def test_float32_stays_float32():
-    cast = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), tree)
-    for name in ("matrix", "all by place"):
-        solver = schemes(name)[2]
-        y, *_ = step(system(name), solver, jnp.float32(0), jnp.float32(0.1), cast(Y0))
-        assert {x.dtype for x in y} == {jnp.dtype("float32")}
-        assert_close(y, step(system(name), solver, 0.0, 0.1, Y0)[0], 3e-6)
-
-
-# Any other force.
-
-
-def motor(t, q, v, args):
-    return jnp.sin(t) - 0.2 * v - 0.1 * jnp.tanh(v) * q**2
-
-
-def test_any_force():
-    forced = dps.MechanicalSystem(DENSE, driven, dps.ConstantDamping(0.1), force=motor)
-    mass = np.array(MASS)
-    gradient = jax.jit(jax.grad(driven, argnums=1))
-
-    def rhs(t, y):
-        q, p = y[:3], y[3:]
-        v = np.linalg.solve(mass, p)
-        extra = np.sin(t) - 0.2 * v - 0.1 * np.tanh(v) * q**2
-        return np.concatenate([v, -np.asarray(gradient(t, q, None)) - 0.1 * p + extra])
-
-    exact = scipy.integrate.solve_ivp(
-        rhs, (0, 1), np.concatenate(Y0), "DOP853", rtol=1e-13, atol=1e-14
-    ).y[:, -1]
-    finder = optx.Newton(rtol=1e-12, atol=1e-12)
-    solvers = [
-        (dps.PresymplecticGauss(4), 1e-10),
-        (dps.PresymplecticCoupled(4), 1e-5),
-        (dps.PresymplecticGauss(1, finder), 5e-3),
-    ]
-    for solver, tolerance in solvers:
-        found = flat(solve(forced, solver, 0.0, 1.0, 0.05, Y0).ys)
-        np.testing.assert_allclose(found, exact, atol=tolerance)
-    with pytest.raises(ValueError, match="PresymplecticGauss"):
-        step(forced, dps.TunedRKN6(), 0.0, 0.1, Y0)
-
-
 def test_copies_that_part_are_not_a_success():
     number = 3
     weights = number - jnp.maximum(*jnp.meshgrid(jnp.arange(3), jnp.arange(3)))
@@ -608,63 +368,52 @@ def test_copies_that_part_are_not_a_success():
     def potential(t, q, args):
         return -9.81 * jnp.sum((number - jnp.arange(3.0)) * jnp.cos(q))
 
-    chain = dps.LagrangianSystem(mass, potential, friction=STIFFNESS)
+    chain = dps.LagrangianSystem(mass, potential, dps.ViscousDamping(STIFFNESS))
     y0 = jnp.array([1.0, 1.5, 2.0]), jnp.zeros(3)
-    exact = flat(solve(chain, dps.PresymplecticGauss(6), 0.0, 2.0, 0.02, y0).ys)
     coupled = dps.PresymplecticCoupled(2)
-    for solver, parts in [
-        (coupled, True),
-        (dps.Compensated(coupled), True),
-    ]:
+    for solver in (coupled, dps.Compensated(coupled)):
         sol = solve(chain, solver, 0.0, 2.0, 0.05, y0, throw=False)
-        failed = sol.result != dfx.RESULTS.successful
-        assert failed or np.max(np.abs(flat(sol.ys) - exact)) < 1
-        assert failed or not parts
+        assert sol.result != dfx.RESULTS.successful
 
 
 # Energy.
 
 
-@pytest.mark.parametrize("name", ["sum", "and time", "all by place"])
+@pytest.mark.parametrize(
+    "name", ["sum", "wind", pytest.param("all by place", marks=pytest.mark.slow)]
+)
 def test_energy_balance(name):
-    term, solver = system(name), schemes(name)[2]
+    solver = dps.BlanesMoan6() if name in LOCAL else dps.TunedRKN6()
     saveat = dfx.SaveAt(t0=True, steps=True)
-    sol = dfx.diffeqsolve(*(term, solver, 0.0, 2.0, 0.01, Y0), saveat=saveat)
+    sol = solve(system(name), solver, 0.0, 2.0, 0.01, Y0, saveat=saveat, max_steps=201)
     taken = np.isfinite(saved(sol)[0])
     ts, ys = jax.tree.map(lambda x: x[taken], saved(sol))
-    assert np.max(np.abs(energy_error(term, ts, ys))) < 1e-7
+    assert np.max(np.abs(energy_error(system(name), ts, ys))) < 1e-7
 
 
 def test_power_lost():
-    free = dps.MechanicalSystem(DENSE, harmonic, dps.ViscousDamping(C))
-    term = free
+    term = dps.MechanicalSystem(DENSE, harmonic, dps.ViscousDamping(C))
     saveat = dfx.SaveAt(ts=jnp.linspace(0, 2, 201))
-    sol = dfx.diffeqsolve(*(term, dps.TunedRKN6(), 0.0, 2.0, 0.1, Y0), saveat=saveat)
-    ts, ys = saved(sol)
+    ts, ys = saved(solve(term, dps.TunedRKN6(), 0.0, 2.0, 0.1, Y0, saveat=saveat))
     v = jnp.linalg.solve(MASS, ys[1].T).T
     wanted = jnp.einsum("ni,ij,nj->n", v, C, v)
     np.testing.assert_allclose(power_lost(term, ts, ys), wanted, atol=1e-14)
-    lost = energy_lost(term, ts, ys)
     energies = energy(term, ts, ys)
-    np.testing.assert_allclose(energies + lost, energies[0], atol=1e-8)
-    joints = dps.LagrangianSystem(lambda t, q, a: MASS, harmonic, friction=C)
-    same = power_lost(joints, ts, ys)
-    np.testing.assert_allclose(same, wanted, atol=1e-14)
+    total = energies + energy_lost(term, ts, ys)
+    np.testing.assert_allclose(total, energies[0], atol=1e-8)
+    joints = dps.LagrangianSystem(lambda t, q, a: MASS, harmonic, dps.ViscousDamping(C))
+    np.testing.assert_allclose(power_lost(joints, ts, ys), wanted, atol=1e-14)
 
 
 # Errors.
 
-KINETIC = dps.QuadraticKinetic()
 NUMBER: Any = 0.3
 UNKNOWN = dps.RelativisticKinetic()
 MISTAKES = {
-    "a number": (
-        lambda: dps.MechanicalSystem(KINETIC, harmonic, 0.3),
-        r"ConstantDamping\(rate\)",
-    ),
     "not finite": (lambda: dps.ConstantDamping(jnp.nan), "must be finite"),
     "not finite matrix": (lambda: dps.ViscousDamping(C * jnp.inf), "must be finite"),
     "not finite drag": (lambda: dps.Drag(jnp.nan), "must be finite"),
+    "not finite wind": (lambda: dps.Drag(0.1, medium=WIND * jnp.nan), "be finite"),
     "exponent": (lambda: dps.Drag(0.1, 0.5), "at least 1"),
     "no coefficients": (lambda: dps.ViscousDamping(None), r"ViscousDamping\(1.0\)"),
     "function and law": (
@@ -706,6 +455,8 @@ SHAPES = {
     "place": (dps.PositionDamping(lambda t, q, args: jnp.ones(2)), "does not fit"),
     "drag by entry": (dps.Drag(jnp.ones(3)), "one for each body"),
     "drag by place": (dps.Drag(lambda t, q, args: jnp.ones(3)), "one for each body"),
+    "wind": (dps.Drag(0.1, medium=jnp.ones(2)), "does not fit"),
+    "wind by place": (dps.Drag(0.1, medium=lambda t, q, a: jnp.ones(2)), "does not"),
     "laws of time": (
         [dps.ViscousDamping(C), dps.LogDamping(1.0)],
         "no exact flow together",
@@ -728,33 +479,3 @@ def test_drag_needs_bodies():
     wrong = dps.MechanicalSystem(unequal, harmonic, dps.Drag(0.1))
     with pytest.raises(ValueError, match="one for each body"):
         step(wrong, dps.BlanesMoan4(), 0.0, 0.1, Y0)
-
-
-@pytest.mark.parametrize("law", ["matrix", "drag"])
-def test_events(law):
-    """A body that falls to the ground, whose height is known in closed form."""
-    c = 0.4
-    friction = dps.ViscousDamping(c * jnp.eye(2)) if law == "matrix" else dps.Drag(c)
-    ball = dps.MechanicalSystem(
-        dps.QuadraticKinetic(), lambda t, q, args: q[1], friction
-    )
-    solver = dps.TunedRKN6() if law == "matrix" else dps.BlanesMoan6()
-    if law == "matrix":
-        height = lambda t: 2.0 - t / c - math.expm1(-c * t) / c**2
-    else:
-        height = lambda t: 2.0 - math.log(math.cosh(t * c**0.5)) / c
-    landing = scipy.optimize.brentq(height, 0, 10, xtol=1e-15)
-
-    @jax.jit
-    def fly(start):
-        return dfx.diffeqsolve(
-            *(ball, solver, 0.0, 10.0, 0.1),
-            (jnp.stack([jnp.zeros(()), start]), jnp.zeros(2)),
-            event=dfx.Event(
-                lambda t, y, args, **kwargs: y[0][1], optx.Newton(1e-13, 1e-13)
-            ),
-        )
-
-    sol = fly(jnp.asarray(2.0))
-    assert sol.result == dfx.RESULTS.event_occurred
-    assert abs(sol.ts[0] - landing) < 1e-9

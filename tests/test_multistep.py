@@ -131,10 +131,9 @@ def test_one_evaluation_per_step():
 
     def counted(t, q, args):
         jax.debug.callback(lambda: count.append(1))
-        return jnp.sin(q)
+        return -jnp.sin(q)
 
-    kinetic = dps.QuadraticKinetic()
-    hamiltonian = dps.MechanicalSystem(kinetic, pendulum, force=counted)
+    hamiltonian = dps.MechanicalSystem(dps.QuadraticKinetic(), dps.ForceField(counted))
     numbers = []
     for n in (20, 60):
         count.clear()
@@ -223,11 +222,11 @@ def test_a_change_of_the_step_is_not_undone(wrap):
     def loss(x, adjoint, *args):
         return jnp.sum(run(x, adjoint, *args).ys[0] ** 2)
 
-    fixed, reversible = dps.FixedStepAdjoint(), dps.FixedStepAdjoint()
+    fixed, reversible = dps.FixedStepAdjoint("checkpoints"), dps.FixedStepAdjoint()
     slope = jax.grad(loss)(ONE, fixed, ts)
     up, down = (loss(x, fixed, ts) for x in (ONE + 1e-5, ONE - 1e-5))
     assert_close(slope, (up - down) / 2e-5, 1e-8)
-    with pytest.raises(RuntimeError, match="its history"):
+    with pytest.raises(RuntimeError, match="without its history"):
         jax.block_until_ready(jax.grad(loss)(ONE, reversible, ts))
     # A change before the solve, which goes on with equal steps, does not matter.
     sol = run(ONE, fixed, ts)
@@ -369,11 +368,6 @@ def test_bad_input():
             dps.SymmetricMultistep(order)
     with pytest.raises(ValueError, match="TunedRKN6"):
         dps.SymmetricMultistep(4)
-    rho: Any
-    for rho in ((1, -2, 2), (2, -2, 2, -1, 0), (1, -3, 2, -1, 0), 3, (1, -4, 6, -4, 2)):
-        with pytest.raises(ValueError, match="rho"):
-            dps.SymmetricMultistep(8, rho)
-    assert own.order(None) == 8
     relativistic = dps.ConformalHamiltonian(
         dps.RelativisticKinetic(), pendulum, dps.ConstantDamping(0.1)
     )

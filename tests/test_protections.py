@@ -138,5 +138,3 @@ def test_checked_is_the_same_scheme():
     plain = step(HENON, BASES[2], 0.5, 0.6, Y0)
     assert_close(checked[0], plain[0], 0)
     assert checked[4] == dfx.RESULTS.successful
-
-

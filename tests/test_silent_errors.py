@@ -171,7 +171,9 @@ def test_an_energy_that_is_infinite_at_the_distance_one():
     np.testing.assert_allclose(slope, 1 / 9)
 
 
-@pytest.mark.parametrize("saveat", [dfx.SaveAt(t1=True), dfx.SaveAt(ts=np.array([0.5, 40.0]))])
+@pytest.mark.parametrize(
+    "saveat", [dfx.SaveAt(t1=True), dfx.SaveAt(ts=np.array([0.5, 40.0]))]
+)
 def test_a_step_that_is_too_large_is_a_failure(saveat):
     system = dps.ConformalHamiltonian(
         dps.QuadraticKinetic(), lambda t, q, args: jnp.sum(q**4) / 4, None

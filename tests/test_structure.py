@@ -97,9 +97,7 @@ def doubled_step(hamiltonian, solver, t0, t1, y, copy):
     if not isinstance(solver, dps.PresymplecticCoupled):
         field = hamiltonian.velocity(t0, q, p_copy), hamiltonian.force(t0, q, p_copy)
         carry = copy, field
-    y, _, _, carry, _ = solver.step(
-        hamiltonian, t0, t1, y, None, carry, False
-    )
+    y, _, _, carry, _ = solver.step(hamiltonian, t0, t1, y, None, carry, False)
     # The first leaves are the copy, or the difference.
     return y, jtu.tree_leaves(carry)[:2]
 

@@ -86,7 +86,9 @@ SYSTEMS = {
         eta2=dps.LogDamping(1.0, shift=1.0),
     ),
     "double well": dps.ConformalHamiltonian(
-        dps.QuadraticKinetic(), driven_double_well, [dps.LogDamping(0.3), dps.PowerDamping(0.1, 0.5)]
+        dps.QuadraticKinetic(),
+        driven_double_well,
+        [dps.LogDamping(0.3), dps.PowerDamping(0.1, 0.5)],
     ),
 }
 Y0 = (jnp.array([1.0, 0.5]), jnp.array([0.3, -0.7]))

@@ -62,6 +62,13 @@ def _rates(part: LinearPart, mechanics: Mechanics, p: PyTree) -> list[Array]:
         masses = jtu.tree_leaves(fit_form(mechanics.mass, p, MASS, "p"))
         rows = zip(rates, masses, jtu.tree_leaves(p), strict=True)
         return [_per_momentum(*row) for row in rows]
+    if any(
+        is_matrix(x, like) for x, like in zip(rates, jtu.tree_leaves(p), strict=True)
+    ):
+        raise ValueError(
+            "The damping is a matrix for a `p` of which it couples the entries. Friction "
+            "by a matrix is given per velocity: write `ViscousDamping(matrix)`."
+        )
     return rates
 
 

@@ -29,8 +29,7 @@ def terms(self: HamiltonianField, solver: dps.extend.AbstractPresymplecticSolver
     def potential(t, q, args):
         return jnp.sum(self.potential._potential(q, t))  # of all orbits of a batch
 
-    kinetic = dps.QuadraticKinetic()
-    return dps.MechanicalSystem(kinetic, potential)
+    return dps.MechanicalSystem(dps.QuadraticKinetic(), potential)
 
 
 solver = gd.OrbitSolver(

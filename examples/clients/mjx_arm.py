@@ -62,7 +62,8 @@ def potential(t, q, args):
     return weight + jnp.sum(arm.jnt_stiffness * (q - arm.qpos_spring) ** 2) / 2
 
 
-system = dps.LagrangianSystem(mass_matrix, potential, friction=dps.ViscousDamping(arm.dof_damping))
+damping = dps.ViscousDamping(arm.dof_damping)
+system = dps.LagrangianSystem(mass_matrix, potential, damping)
 q0, ts = jnp.array([1.2, 0.4, -0.5]), jnp.linspace(0.0, 5.0, 101)
 start = time.perf_counter()
 sol = dfx.diffeqsolve(

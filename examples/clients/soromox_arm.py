@@ -39,8 +39,7 @@ q0, v0 = jnp.array([1.0, 0.5, -0.3, 0.2]), jnp.zeros(n)
 system = dps.LagrangianSystem(
     mass_matrix=lambda t, q, args: robot.inertia_matrix(q),
     potential=lambda t, q, args: robot.potential_energy(q),
-    # The coefficients are constant for this robot.
-    friction=dps.ViscousDamping(robot.damping_matrix(q0)),
+    friction=dps.ViscousDamping(robot.damping_matrix(q0)),  # constant for this robot
 )
 ts = jnp.linspace(0.0, 5.0, 101)
 sol = dfx.diffeqsolve(
@@ -49,7 +48,7 @@ sol = dfx.diffeqsolve(
     t0=0.0,
     t1=5.0,
     dt0=0.01,
-    y0=(q0, system.from_velocity(0.0, q0, v0)),
+    y0=system.from_velocity(0.0, (q0, v0)),
     saveat=dfx.SaveAt(ts=ts),
     adjoint=dps.FixedStepAdjoint(),
 )

@@ -61,12 +61,11 @@ class NesterovMove(dps.extend.AbstractMove):
         return system.prepare_decay(span.t0, span.h)
 
     def apply(self, system, span, data, stage):
-        y, carry = stage
-        _, t1, h = span
-        y = q, p = system.decay(data, y)
-        ahead, _ = system.add(y, (h * system.velocity(t1, y), None))
-        _, p = system.add(y, (None, h * system.force(t1, (ahead, p))))
-        return (system.add((q, p), (h * system.velocity(t1, (q, p)), None)), carry), None
+        (y, carry), (_, t1, h) = stage, span
+        drift = lambda y: system.add(y, (h * system.velocity(t1, y), None))
+        y = system.decay(data, y)
+        y = system.add(y, (None, h * system.force(t1, drift(y))))
+        return (drift(y), carry), None
 
     def undo(self, system, span, data, stage):
         raise NotImplementedError
