@@ -14,7 +14,7 @@ PYTEST = -m pytest -q -n $(WORKERS) --dist worksteal
 EXAMPLES := $(sort $(filter-out examples/_%,$(wildcard examples/*.py)))
 # The experiments of the paper share code, so they are run as modules.
 PAPER := $(notdir $(basename $(filter-out examples/paper/_%,$(wildcard examples/paper/*.py))))
-BENCHMARKS := against_loop between_steps compile_time schemes tuning work_precision choose_step batches \
+BENCHMARKS := against_loop compile_time schemes stability tuning work_precision choose_step batches \
 	nonseparable gauss multistep friction hard_cases gradients limits
 
 # Figures are saved to files, without a display.
@@ -50,7 +50,7 @@ typed: $(VENV)/.with-tests  ## Run tests with annotations checked at run time
 		--jaxtyping-packages=diffrax_presym,beartype.beartype \
 		$(addprefix tests/test_,order.py friction.py wrappers.py diagnostics.py step_density.py)
 
-oldest: TESTS ?= tests/test_docs.py tests/test_stages.py
+oldest: TESTS ?= tests/test_docs.py tests/test_diffrax_contract.py
 oldest: $(OLDEST)/.installed  ## Test the documentation with the oldest dependencies
 	@$(OLDEST)/bin/python $(PYTEST) -W ignore::DeprecationWarning $(TESTS)
 

@@ -57,8 +57,7 @@ RIVALS = [
 
 class Batch(NamedTuple):
     problem: problems.Problem
-    # The first `n` starting points, with an array for each coordinate.
-    starts: Callable
+    starts: Callable  # the first `n` starting points
 
 
 def spread(n, *boxes):
@@ -73,18 +72,15 @@ def spread(n, *boxes):
     ]
 
 
-def pendulums():
-    # The hardest first.
-    starts = lambda n: tuple(spread(n, (2.5, 5.0), (0.0, 1.0)))
-    return Batch(problems.pendulum(), starts)
+def henon_starts(n):
+    x, y, px, py = spread(n, *[(0.25, 0.5)] * 4)
+    return (x, y), (px, py)
 
 
-def henon_heiles():
-    def starts(n):
-        x, y, px, py = spread(n, *[(0.25, 0.5)] * 4)
-        return (x, y), (px, py)
-
-    return Batch(problems.henon_heiles(), starts)
+# The hardest first.
+pendulum_starts = lambda n: tuple(spread(n, (2.5, 5.0), (0.0, 1.0)))
+PENDULUMS = Batch(problems.pendulum(), pendulum_starts)
+HENON_HEILES = Batch(problems.henon_heiles(), henon_starts)
 
 
 def batched(problem, method):
@@ -227,7 +223,7 @@ def heyoka_runs(batch, n, errors):
             solves = [make(target * 10 ** (-k / 2), lanes) for k in range(7)]
             reach = [s for s in solves if errors.of(s()) <= target]
             best = min(reach, key=lambda s: timed(s)[1])
-            runs["heyoka", f"heyoka, {name}", target] = best
+            runs[f"heyoka, {name}", f"heyoka, {name}", target] = best
     return runs
 
 
@@ -261,7 +257,7 @@ def compare_with_heyoka(batch, methods, n, repeats):
 
     def best(group, target, clock):
         keys = (key for key in found if (key[0], key[2]) == (group, target))
-        return min(getattr(found[key], clock) for key in keys)
+        return min((getattr(found[key], clock) for key in keys), default=math.nan)
 
     for target in TARGETS:
         cells = []
@@ -276,9 +272,7 @@ def compare_with_heyoka(batch, methods, n, repeats):
 
 def main():
     parser = command_line(__doc__)
-    parser.add_argument(
-        "--longest", type=float, help="omit solves that take more seconds"
-    )
+    parser.add_argument("--longest", type=float, help="omit solves that take longer")
     options = parser.parse_args()
     quick = options.quick
     repeats = 1 if quick else 5
@@ -286,9 +280,9 @@ def main():
     sizes = (1, 64, 256) if quick else SIZES
     print(f"{jax.devices()[0].device_kind}, median of {repeats} runs")
     methods = [OURS[2], RIVALS[3]] if quick else OURS + RIVALS
-    scaling(pendulums(), methods, sizes, repeats, longest)
+    scaling(PENDULUMS, methods, sizes, repeats, longest)
     few = [m for m in methods if m in OURS[2:] + RIVALS[3:]]
-    for batch in pendulums(), henon_heiles():
+    for batch in PENDULUMS, HENON_HEILES:
         compare_with_heyoka(batch, few, sizes[-1] if quick else 1024, repeats)
 
 

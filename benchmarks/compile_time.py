@@ -16,6 +16,7 @@ import statistics
 import subprocess
 import sys
 import time
+from typing import Any
 
 import diffrax as dfx
 import jax
@@ -27,8 +28,11 @@ import diffrax_presym as dps
 
 N = 6
 SPAN = 10.0
-OURS = {"scalar friction": dps.TunedRKN6(), "matrix friction": dps.TunedRKN6()}
-OURS |= {"M(q), Gauss": dps.PresymplecticGauss(4)}
+OURS = {
+    "scalar friction": dps.TunedRKN6(),
+    "matrix friction": dps.TunedRKN6(),
+    "M(q), Gauss": dps.PresymplecticGauss(4),
+}
 SAVED = {"end": None, "501 times": 501, "gradient": None}
 
 
@@ -65,7 +69,7 @@ def cold(kind, what, solver):
     system, count = system_of(kind), SAVED[what]
     ts = None if count is None else jnp.linspace(0.0, SPAN, count)
     saveat = dfx.SaveAt(t1=True) if ts is None else dfx.SaveAt(ts=ts)
-    options = options_of(solver) | {"saveat": saveat}
+    options: Any = options_of(solver) | {"saveat": saveat}
     y0 = jnp.linspace(0.1, 1.0, N), jnp.zeros(N)
 
     def run(y0):
@@ -81,7 +85,7 @@ def cold_readme(solver):
     """Seconds to the README's first result, and then to its first gradient."""
     ts, y0 = jnp.linspace(0, 50, 501), (jnp.array([2.0, 0.5]), jnp.zeros(2))
     ours = isinstance(solver, dps.extend.AbstractPresymplecticSolver)
-    options = options_of(solver, 1e-4) | {"saveat": dfx.SaveAt(ts=ts)}
+    options: Any = options_of(solver, 1e-4) | {"saveat": dfx.SaveAt(ts=ts)}
 
     def solution(dt0, rate):
         system = dps.MechanicalSystem(
@@ -139,7 +143,7 @@ def main():
         side, kind, *what = options.task
         ours = OURS.get(kind, dps.TunedRKN6())
         solver = ours if side == "ours" else dfx.Tsit5()
-        print(*(cold(kind, *what, solver) if what else cold_readme(solver)))
+        print(*(cold(kind, what[0], solver) if what else cold_readme(solver)))
         return
     repeats = 1 if options.quick else 5
     columns = "ours, s:>8.2f", "Tsit5, s:>8.2f", "ratio:>6.2f"

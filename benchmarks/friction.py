@@ -8,10 +8,9 @@ of solves with matrix friction of 50 unknowns, that save at 401 times: few long 
 over many short ones.
 """
 
-import dataclasses
 import math
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -22,6 +21,7 @@ from _report import command_line, means, Table
 from _schemes import DIFFRAX, SCHEMES
 from _solve import MOST, reference_end, relative_error, solve, states
 from _timing import error_curves, fastest, interleaved
+from problems import mechanics
 
 import diffrax_presym as dps
 
@@ -36,10 +36,9 @@ STRANG_8 = SCHEMES["SofroniouSpaletta8"]._replace(
 OURS = SCHEMES | {"SofroniouSpaletta8, Strang": STRANG_8}
 
 
-@dataclasses.dataclass(frozen=True)
-class System:
+class System(NamedTuple):
     name: str
-    system: dps.extend.AbstractSystem
+    system: Any
     y0: Any
     t1: float
     schemes: tuple[str, ...]
@@ -50,12 +49,8 @@ def chain():
     """Ten pendulums with springs between them, unit inertia, and a damper at each."""
     dampers = jnp.linspace(0.05, 0.5, 10)
 
-    def potential(t, q, args):
-        return 2 * jnp.sum((q[1:] - q[:-1]) ** 2) - jnp.sum(jnp.cos(q))
-
-    system = dps.MechanicalSystem(
-        dps.QuadraticKinetic(), potential, dps.ViscousDamping(dampers)
-    )
+    potential = lambda t, q, args: 2 * jnp.sum(jnp.diff(q) ** 2) - jnp.sum(jnp.cos(q))
+    system = mechanics(potential, dps.ViscousDamping(dampers))
     y0 = jnp.linspace(1.5, -0.5, 10), jnp.zeros(10)
     return System("chain of 10", system, y0, 20.0, NYSTROM, 1.5)
 
@@ -76,7 +71,7 @@ def network():
 
     friction = dps.RayleighDamping(0.05, 0.02, stiffness)
     masses = jnp.asarray(rng.uniform(0.5, 2, n))
-    system = dps.MechanicalSystem(dps.QuadraticKinetic(masses), potential, friction)
+    system = mechanics(potential, friction, dps.QuadraticKinetic(masses))
     y0 = jnp.asarray(rng.normal(size=n)), jnp.zeros(n)
     return System("network of 200", system, y0, 20.0, NYSTROM, 1.2)
 
@@ -91,9 +86,7 @@ def wave():
     def potential(t, q, args):
         return speed**2 * (jnp.sum(jnp.diff(q) ** 2) + q[0] ** 2 + q[-1] ** 2) / 2
 
-    system = dps.MechanicalSystem(
-        dps.QuadraticKinetic(), potential, dps.ConstantDamping(layer)
-    )
+    system = mechanics(potential, dps.ConstantDamping(layer))
     y0 = jnp.exp(-(((x - 0.4) / 0.03) ** 2)), jnp.zeros(n)
     return System("wave equation", system, y0, 1.0, NYSTROM, math.pi / speed)
 
@@ -102,11 +95,8 @@ def charge():
     """A charged particle in a field, a trap that is not harmonic, and friction."""
     field = 3 * jnp.array([[0.0, -1.0, 0.2], [1.0, 0.0, -0.4], [-0.2, 0.4, 0.0]])
 
-    def potential(t, q, args):
-        return jnp.sum(q**4) / 4 + q[0] ** 2 * q[1] / 2
-
-    friction = dps.ViscousDamping(field + 0.05 * jnp.eye(3))
-    system = dps.MechanicalSystem(dps.QuadraticKinetic(), potential, friction)
+    potential = lambda t, q, args: jnp.sum(q**4) / 4 + q[0] ** 2 * q[1] / 2
+    system = mechanics(potential, dps.ViscousDamping(field + 0.05 * jnp.eye(3)))
     y0 = jnp.array([1.0, 0.3, -0.5]), jnp.array([0.0, 0.7, 0.2])
     return System("charged particle", system, y0, 50.0, NYSTROM, 2.0)
 
@@ -122,7 +112,7 @@ def projectiles():
         return jnp.sum(masses * gravity * height / (1 + height / radius))
 
     drag = dps.Drag(masses * jnp.asarray(rng.uniform(5e-4, 2e-3, (n, 1))))
-    system = dps.MechanicalSystem(dps.QuadraticKinetic(masses), potential, drag)
+    system = mechanics(potential, drag, dps.QuadraticKinetic(masses))
     velocities = rng.normal(size=(n, 3)) * 50 + [100, 0, 200]
     y0 = jnp.zeros((n, 3)), masses * jnp.asarray(velocities)
     return System("projectiles", system, y0, 20.0, GENERAL, 4.0)
@@ -130,16 +120,9 @@ def projectiles():
 
 def planet():
     """A planet in gas whose density depends on the radius."""
-
-    def potential(t, q, args):
-        return -1 / jnp.linalg.norm(q)
-
-    def rate(t, q, args):
-        return 0.001 * jnp.exp(-4 * (jnp.linalg.norm(q) - 1))
-
-    system = dps.MechanicalSystem(
-        dps.QuadraticKinetic(), potential, dps.PositionDamping(rate)
-    )
+    potential = lambda t, q, args: -1 / jnp.linalg.norm(q)
+    rate = lambda t, q, args: 0.001 * jnp.exp(-4 * (jnp.linalg.norm(q) - 1))
+    system = mechanics(potential, dps.PositionDamping(rate))
     y0 = jnp.array([1.1, 0.0, 0.0]), jnp.array([0.0, 0.9, 0.1])
     return System("planet in gas", system, y0, 50.0, GENERAL, 4.0)
 
@@ -252,8 +235,7 @@ def many_times(quick):
     rng = np.random.default_rng(0)
     dampers = jnp.asarray(0.2 * np.eye(n) + 0.02 * rng.normal(size=(n, n)))
     potential = lambda t, q, args: jnp.sum(jnp.diff(q) ** 2) - jnp.sum(jnp.cos(q))
-    law = dps.ViscousDamping(dampers)
-    system = dps.MechanicalSystem(dps.QuadraticKinetic(), potential, law)
+    system = mechanics(potential, dps.ViscousDamping(dampers))
     y0, ts = (jnp.linspace(-1.0, 1.0, n), jnp.zeros(n)), jnp.linspace(0, t1, 401)
     exact = jnp.asarray(reference_end(system, y0, 0.0, t1))
     table = Table(

@@ -41,8 +41,7 @@ def chain_mass(t, q, args):
 
 
 def chain_potential(t, q, args):
-    n = len(q)
-    return -GRAVITY * jnp.sum((n - np.arange(n)) * jnp.cos(q))
+    return -GRAVITY * jnp.sum((len(q) - np.arange(len(q))) * jnp.cos(q))
 
 
 def chain(n, friction=0.1):

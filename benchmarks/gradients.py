@@ -49,6 +49,8 @@ SAVES = {
     "101": dfx.SaveAt(ts=jnp.linspace(0.0, T1, 101)),
 }
 LEAPFROG = dps.PresymplecticLeapfrog()
+# With the factor by which a step is longer.
+SOLVERS = {"leapfrog": (LEAPFROG, 1), "TunedRKN6": (dps.TunedRKN6(), 20)}
 
 
 def loss_of(system, adjoint, steps, saved="t1", solver: Any = LEAPFROG):
@@ -109,6 +111,13 @@ def compiled(loss, at):
     return partial(jax.jit(loss).lower(*at).compile(), *at)
 
 
+def over_solve(found, names):
+    """Milliseconds of the solve alone, and the ratios to it of those measured."""
+    alone = found["solve"]
+    ratios = (found[x].over(alone) if x in found else None for x in names)
+    return alone.median * 1e3, *ratios
+
+
 def times(system, sizes, counts, repeats):
     table = Table(
         f"Value and gradient over the solve alone, {system}",
@@ -124,9 +133,7 @@ def times(system, sizes, counts, repeats):
             }
             once = n * steps > LONG
             found = interleaved(programs, 1 if once else repeats, warm_up=not once)
-            alone = found["solve"]
-            ratios = [found[x].over(alone) if x in found else None for x in MOST]
-            table.row(n, steps, alone.median * 1e3, *ratios)
+            table.row(n, steps, *over_solve(found, MOST))
 
 
 def batches(sizes, counts, repeats):
@@ -139,12 +146,9 @@ def batches(sizes, counts, repeats):
         q, gamma = jnp.linspace(0.5, 2.0, batch)[:, None], jnp.array(0.1)
         at = (q, jnp.zeros_like(q)), gamma
         each = partial(jax.vmap, in_axes=(0, None))
-        for scheme, solver, fewer in (
-            ("leapfrog", LEAPFROG, 1),
-            ("TunedRKN6", dps.TunedRKN6(), 20),
-        ):
-            for steps, saved in itertools.product(counts, SAVES):
-                steps = steps // fewer
+        for scheme, (solver, fewer) in SOLVERS.items():
+            for count, saved in itertools.product(counts, SAVES):
+                steps = count // fewer
                 loss = partial(loss_of, "pendulums", steps=steps, saved=saved)
                 loss = partial(loss, solver=solver)
                 programs = {"solve": compiled(each(loss(REVERSAL)), at)}
@@ -153,11 +157,8 @@ def batches(sizes, counts, repeats):
                         fn = each(with_gradient(loss(adjoint)))
                         programs[name] = compiled(fn, at)
                 found = interleaved(programs, repeats)
-                alone = found["solve"]
-                ratios = [
-                    found[x].over(alone) if x in found else None for x in ADJOINTS
-                ]
-                table.row(batch, scheme, steps, saved, alone.median * 1e3, *ratios)
+                cells = over_solve(found, ADJOINTS)
+                table.row(batch, scheme, steps, saved, *cells)
 
 
 def memory(n, counts):

@@ -3,27 +3,6 @@
 import numpy as np
 
 
-def scipy_runs(problem, tolerances):
-    """SciPy's DOP853, the same right-hand side in NumPy."""
-    try:
-        from scipy.integrate import solve_ivp
-    except ImportError:
-        return {}
-    if len(problem.q0) > 100:
-        return {}
-    n = len(problem.q0)
-    y0 = np.concatenate([problem.q0, problem.p0])
-    rhs = lambda t, y: np.concatenate(problem.rhs(t, y[:n], y[n:]))
-
-    def solve(tolerance):
-        rtol = max(tolerance, 3e-14)
-        ends = 0, problem.t1
-        sol = solve_ivp(rhs, ends, y0, "DOP853", rtol=rtol, atol=tolerance)
-        return sol.y[:, -1].reshape(2, n)
-
-    return {"scipy DOP853": (solve, list(tolerances))}
-
-
 def heyoka_runs(problem, tolerances):
     """heyoka's Taylor integrator, compiled once for each tolerance."""
     try:

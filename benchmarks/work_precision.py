@@ -5,8 +5,7 @@ interleaved in one process. A point is the median time and the error of the solu
 the final time: the largest entry, relative to that of the solution, since damping
 shrinks both, against `reference`. Tables give the time to reach an error, read off each
 method's curve, and the geometric mean over the problems of (best Diffrax solver) / (our
-best). The figure goes to `docs/img/`. SciPy and heyoka are measured if they are
-installed.
+best). The figure goes to `docs/img/`. heyoka is measured if it is installed.
 
 `--set tuning` and `--set test` measure the two halves of a larger set of problems,
 without solvers from outside of JAX, with the worst problem beside the mean: nothing in
@@ -35,8 +34,8 @@ from _plot import error_against_time, FOLDER
 from _report import command_line, means, Table
 from _schemes import DIFFRAX, Scheme, SCHEMES
 from _solve import relative_error, states
-from _timing import error_curves, fastest, time_to
-from outside import heyoka_runs, scipy_runs
+from _timing import error_curves, fastest
+from outside import heyoka_runs
 
 import diffrax_presym as dps
 
@@ -69,6 +68,7 @@ SETS = {
     "test": problems_test.PROBLEMS,
 }
 SAVED = 201
+GROUPS = ("ours", "Diffrax", "heyoka")
 
 
 def solver_of(problem, solver, terms=None, ts=None, **options):
@@ -151,11 +151,8 @@ def all_runs(problem, quick, ts=None):
     if separable:
         run = semi_implicit_euler(problem, ts)
         runs["Diffrax", "SemiImplicitEuler"] = run, counts(1)
-    if problem.rhs is None or ts is not None:
-        return runs
-    tolerances = TOLERANCES[1::4] if quick else TOLERANCES
-    outside = heyoka_runs(problem, tolerances) | scipy_runs(problem, tolerances[::2])
-    return runs | {("outside", name): run for name, run in outside.items()}
+    outside = {} if ts is not None else heyoka_runs(problem, TOLERANCES)
+    return runs | {("heyoka", name): run for name, run in outside.items()}
 
 
 def tables(results):
@@ -165,11 +162,10 @@ def tables(results):
         table = Table("", label, "ours:>19", "us:>6.0f", "Diffrax's:>19", "us:>6.0f")
         both = []
         for problem, curves in results.items():
-            best = [fastest(curves, target, x) for x in ("ours", "Diffrax")]
-            cells = [(name, seconds * 1e6) for seconds, name in best]
+            best = [fastest(curves, target, x) for x in GROUPS]
+            cells = [(name, seconds * 1e6) for seconds, name in best[:2]]
             table.row(problem, *cells[0], *cells[1])
-            taylor = time_to(curves.get(("outside", "heyoka"), []), target)
-            both.append((best[0][0], best[1][0], taylor))
+            both.append([seconds for seconds, _ in best])
         over = lambda a, b: a / b if max(a, b) < math.inf else None
         ratios.append([over(theirs, ours) for ours, theirs, _ in both])
         heyoka.append([over(ours, taylor) for ours, _, taylor in both])
@@ -191,10 +187,7 @@ def tables(results):
 
 def picture(results, path):
     keys = dict.fromkeys(key for curves in results.values() for key in curves)
-    groups = [
-        [name for g, name in keys if g == group]
-        for group in ("ours", "Diffrax", "outside")
-    ]
+    groups = [[name for g, name in keys if g == group] for group in GROUPS]
     named = {
         problem: {name: curve for (_, name), curve in curves.items()}
         for problem, curves in results.items()
@@ -229,7 +222,7 @@ def main():
     options = parser.parse_args()
     repeats = 1 if options.quick else options.repeats
     makers = SETS[options.set]
-    makers = makers[::3] if options.quick else makers
+    makers = makers[:4:3] if options.quick else makers
     if options.only:
         wanted = lambda make: any(part in make().name for part in options.only)
         makers = list(filter(wanted, makers))

@@ -1,5 +1,5 @@
 import inspect
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -10,12 +10,6 @@ import optimistix as optx
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Inexact, PyTree, Real
 
-
-if TYPE_CHECKING:
-    # To a type checker an abstract field is any kind of field.
-    from typing import ClassVar as AbstractVar
-else:
-    from equinox import AbstractVar as AbstractVar
 
 Time = Real[ArrayLike, ""]
 Scalar = Inexact[Array, ""]

@@ -13,7 +13,10 @@ from ._scheme._engine import (
     Span as Span,
     Stages as Stages,
 )
-from ._system._base import AbstractSystem as AbstractSystem
+from ._system._base import (
+    AbstractKineticSystem as AbstractKineticSystem,
+    AbstractSystem as AbstractSystem,
+)
 from ._system._bound import System as System
 from ._system._kinetic import AbstractKinetic as AbstractKinetic
 from ._system._mirror import AbstractMirrorMap as AbstractMirrorMap

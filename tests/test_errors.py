@@ -330,6 +330,18 @@ SOLVERS = {
         Mistake("got <class ", BASE, "`PresymplecticLeapfrog()`"),
     ),
     **{
+        f"Tao in a composition {i}": (
+            lambda solver=solver: trace(TERM, solver),
+            Mistake("`PresymplecticTao` needs", FIXED, "`PresymplecticTao(coupling)`"),
+        )
+        for i, solver in enumerate(
+            [
+                dps.SuzukiYoshida(4, base=dps.PresymplecticTao()),
+                dps.Suzuki4(dps.Substeps(dps.PresymplecticTao(), 2)),
+            ]
+        )
+    },
+    **{
         f"coupling {given}": (
             lambda given=given: dps.PresymplecticTao(given),
             Mistake(f"got {given}", "must be positive", "`PresymplecticTao(coupling)`"),
@@ -528,6 +540,18 @@ HAMILTONIANS = {
         lambda: dps.Hamiltonian(3.0),
         Mistake("got 3.0", "`energy` must be a function", "`E(t, q, p, args)`"),
     ),
+    "force of a wrong shape": (
+        lambda: system(force=lambda t, q, v, args: jnp.ones(3)),
+        Mistake("returned shape (3,)", "arrays of the shapes of `q`", "of shape (2,)"),
+    ),
+    "force of a wrong structure": (
+        lambda: system(force=lambda t, q, v, args: (q, q)),
+        Mistake("returned PyTreeDef((*, *))", "the same structure as `q`", "`force`"),
+    ),
+    "complex force": (
+        lambda: system(force=lambda t, q, v, args: q * jnp.array(1j)),
+        Mistake("`force` must return real", "returned complex128[2]", "`jnp.real`"),
+    ),
     "force of an energy that is not separable": (
         lambda: trace(
             dps.Hamiltonian(mixed_energy, force=lambda t, q, v, args: jnp.ones(3)),
@@ -571,6 +595,14 @@ HAMILTONIANS = {
         lambda: dps.ConformalHamiltonian(KINETIC, damping=DAMPING),
         Mistake("needs", EITHER, "`ConformalHamiltonian(energy=energy, damping=damp"),
     ),
+    "energy and damping by position": (
+        lambda: dps.ConformalHamiltonian(mixed_energy, DAMPING),
+        Mistake(
+            "got ConstantDamping(",
+            "`potential` must be a function `V(t, q, args)`",
+            "write `Hamiltonian(energy)`",
+        ),
+    ),
     "potential before kinetic energy": (
         lambda: dps.MechanicalSystem(harmonic, KINETIC),
         Mistake(
@@ -588,6 +620,12 @@ HAMILTONIANS = {
             "`DissipativeHamiltonian(..., separable=False)` needs",
             "a function `T(t, q, P, args)`",
         ),
+    ),
+    "potential of the general family is no function": (
+        lambda: dps.DissipativeHamiltonian(
+            lambda t, q, P, args: jnp.sum(P**2), 3.0, DAMPING, DAMPING, separable=False
+        ),
+        Mistake("got 3.0", "`potential` must be a function", "`f(t, q, args)`"),
     ),
     "both energies": (
         lambda: dps.ConformalHamiltonian(KINETIC, harmonic, energy=mixed_energy),

@@ -266,10 +266,11 @@ def test_exponentials(scale):
 
 
 @pytest.mark.parametrize("exponent", [1.0, 1.5, 2.0, 3.0])
-@pytest.mark.parametrize("h, medium", [(0.7, None), (-0.2, jnp.array([0.5, -1.0]))])
+@pytest.mark.parametrize("h, medium", [(0.7, None), (-0.2, [0.5, -1.0])])
 def test_the_flow_of_drag(exponent, h, medium):
-    drag, mass = dps.Drag(0.4, exponent, medium), 1.5
-    p, wind = jnp.array([[1.0, -2.0], [0.3, 0.1]]), 0.0 if medium is None else medium
+    drag = dps.Drag(0.4, exponent, None if medium is None else jnp.array(medium))
+    p, wind = jnp.array([[1.0, -2.0], [0.3, 0.1]]), np.asarray(medium or 0.0)
+    mass = 1.5
 
     def rhs(t, x):
         v = x[4:].reshape(2, 2) / mass

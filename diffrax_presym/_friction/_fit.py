@@ -66,8 +66,8 @@ def _rates(part: LinearPart, mechanics: Mechanics, p: PyTree) -> list[Array]:
         is_matrix(x, like) for x, like in zip(rates, jtu.tree_leaves(p), strict=True)
     ):
         raise ValueError(
-            "The damping is a matrix for a `p` of which it couples the entries. Friction "
-            "by a matrix is given per velocity: write `ViscousDamping(matrix)`."
+            "The damping is a matrix that couples the entries of `p`. Friction by a "
+            "matrix is given per velocity: write `ViscousDamping(matrix)`."
         )
     return rates
 

@@ -1,12 +1,11 @@
 import math
 from decimal import Decimal, localcontext
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TYPE_CHECKING
 
 import equinox as eqx
 import optimistix as optx
 
 from .._compositions import stages
-from .._misc import AbstractVar
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, check_base, Scheme
 from ._engine import Stages
@@ -18,6 +17,13 @@ from ._tableaus import (
     SOFRONIOU_SPALETTA_10,
     SUZUKI_4,
 )
+
+
+if TYPE_CHECKING:
+    # To a type checker an abstract field is any kind of field.
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 Weights = tuple[float, ...]

@@ -1,11 +1,10 @@
 import math
-from typing import ClassVar
+from typing import ClassVar, TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
 
 from .._compositions import stages
-from .._misc import AbstractVar
 from .._system._bound import System
 from .._system._split import AbstractSplit
 from ._base import AbstractPresymplecticSolver, Scheme
@@ -22,6 +21,13 @@ from ._tableaus import (
     TUNED_LINEAR_8,
     TUNED_RKN_6,
 )
+
+
+if TYPE_CHECKING:
+    # To a type checker an abstract field is any kind of field.
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 class AbstractSplitting(AbstractPresymplecticSolver):

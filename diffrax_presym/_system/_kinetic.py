@@ -14,7 +14,6 @@ from .._friction._exponential import gauss_legendre
 from .._friction._linear import LinearFriction
 from .._friction._rates import MASS
 from .._misc import (
-    AbstractVar,
     as_positive,
     cast_to,
     largest,
@@ -32,7 +31,7 @@ class AbstractKinetic(eqx.Module):
     """A kinetic energy `T(t, p, args)`, its velocity, and its exact flow."""
 
     # Whether its flow depends on time by the length of its span alone.
-    is_autonomous: AbstractVar[bool]
+    is_autonomous: eqx.AbstractVar[bool]
 
     @property
     @abc.abstractmethod
