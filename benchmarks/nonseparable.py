@@ -101,7 +101,7 @@ def speed(quick, repeats):
         exact = reference_end(H, y0, t0, t1, args)
         for name, (solver, _, cost) in schemes.items():
             fixed = H, solver, times, y0
-            run = lambda n, fixed=fixed, args=args: states(*fixed, n, args=args)
+            run = lambda n, f=fixed, a=args: states(f[0], f[1], f[2], f[3], n, a)
             least = 4 * max(1, (t1 - t0) / longest / cost)
             most = math.log2((3e3 if quick else 6e4) / cost / least)
             n = [round(least * 2 ** (k / 2)) for k in range(math.ceil(2 * most))]

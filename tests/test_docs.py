@@ -33,6 +33,11 @@ PUBLIC |= {
     for name, value in vars(dps.diagnostics).items()
     if not name.startswith("_") and ".diagnostics." in getattr(value, "__module__", "")
 }
+PUBLIC |= {
+    f"extend.{name}": value
+    for name, value in vars(dps.extend).items()
+    if not name.startswith("_")
+}
 REFERENCE = re.compile(
     r"\[`?(diffrax_presym\.[\w.]+)`?\]\[|\]\[(diffrax_presym\.[\w.]+)\]"
 )
@@ -152,7 +157,11 @@ DOCUMENTED_AS_A_WHOLE = {
     "ChosenStep",
     "diagnostics.WorkPrecision",
     "diagnostics.WorkPrecisionRun",
-    "HermiteInterpolation",
+    "extend.HermiteInterpolation",
+    "extend.Scheme",
+    "extend.Span",
+    "extend.Stages",
+    "extend.System",
     "SplittingTableau",
 }
 
