@@ -67,9 +67,9 @@ def seconds(call):
 def cold(kind, what, solver):
     """Seconds of the first call of a solve or of its gradient."""
     system, count = system_of(kind), SAVED[what]
-    ts = None if count is None else jnp.linspace(0.0, SPAN, count)
-    saveat = dfx.SaveAt(t1=True) if ts is None else dfx.SaveAt(ts=ts)
-    options: Any = options_of(solver) | {"saveat": saveat}
+    options: Any = options_of(solver)
+    if count is not None:
+        options["saveat"] = dfx.SaveAt(ts=jnp.linspace(0.0, SPAN, count))
     y0 = jnp.linspace(0.1, 1.0, N), jnp.zeros(N)
 
     def run(y0):
@@ -115,11 +115,8 @@ def cold_readme(solver):
 def in_a_process(*task):
     """The seconds that this script prints for a task, in a process of its own."""
     task = [sys.executable, __file__, "--task", *task]
-    environment = dict(os.environ) | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
-    done = subprocess.run(
-        task, env=environment, check=True, stdout=subprocess.PIPE, text=True
-    )
-    return [float(x) for x in done.stdout.split()]
+    environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
+    return [float(x) for x in subprocess.check_output(task, env=environment).split()]
 
 
 def compared(repeats, *task):

@@ -128,10 +128,8 @@ def planet():
 
 
 # With a loop over stages that is as fast as it can be without gradients.
-SCANNED = {
-    "Tsit5": dfx.Tsit5(scan_kind="lax"),
-    "Dopri5": dfx.Dopri5(scan_kind="lax"),
-    "Dopri8": dfx.Dopri8(scan_kind="lax"),
+SCANNED: dict[str, Any] = {
+    x.__name__: x(scan_kind="lax") for x in (dfx.Tsit5, dfx.Dopri5, dfx.Dopri8)
 }
 SYSTEMS = (chain, network, wave, charge, projectiles, planet)
 ADAPTIVE = 10.0 ** -np.arange(2.5, 13.0, 1.5)

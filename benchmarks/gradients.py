@@ -30,11 +30,10 @@ import diffrax_presym as dps
 
 T1 = 10.0
 REVERSAL = dps.FixedStepAdjoint()
-CHECKPOINTED = dfx.RecursiveCheckpointAdjoint()
 ADJOINTS = {
     "reversal": REVERSAL,
     "checkpoints": dps.FixedStepAdjoint("checkpoints"),
-    "Diffrax's": CHECKPOINTED,
+    "Diffrax's": dfx.RecursiveCheckpointAdjoint(),
 }
 # Steps times unknowns beyond which a method is not tried.
 MOST = {"reversal": 1e10, "checkpoints": 1e8, "Diffrax's": 2e7, "scan": 3e7}

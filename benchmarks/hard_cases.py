@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-import problems
 from _plot import panels, save, slope
 from _report import command_line, Table
 from _schemes import SCHEMES, stability_limit, step_matrices
 from _solve import CONSTANT, last, reference, reference_end, solve
 from _timing import interleaved
+from problems import henon_heiles as damped_henon_heiles, mechanics
 
 import diffrax_presym as dps
 
@@ -28,7 +28,6 @@ LEAPFROG = dps.PresymplecticLeapfrog()
 RKN4 = dps.BlanesMoanRKN4()
 RKN6 = dps.BlanesMoanRKN6()
 QUADRATIC = dps.QuadraticKinetic()
-
 
 harmonic = lambda t, q, args: jnp.sum(q**2) / 2
 pendulum = lambda t, q, args: jnp.sum(1 - jnp.cos(q))
@@ -39,37 +38,23 @@ root = lambda t, q, args: -jnp.sum(jnp.sqrt(q))
 quartic = lambda t, q, args: -jnp.sum(q**4)
 mixed = lambda t, q, p, args: (1 + jnp.sum(q**2)) * (1 + jnp.sum(p**2)) / 2
 duffing = lambda t, q, args: jnp.sum(q**4 / 4 - q**2 / 2 - 0.3 * q * jnp.cos(1.2 * t))
-henon_heiles = problems.henon_heiles().system.potential
+henon_heiles = damped_henon_heiles().system.potential
 
 
 def newton(t, q, args):
     return -1 / jnp.sqrt(jnp.sum(q**2) + (0.0 if args is None else args**2))
 
 
-def conservative(potential, mass=None):
-    return dps.MechanicalSystem(dps.QuadraticKinetic(mass), potential)
-
-
-def damped(potential, damping):
-    return dps.MechanicalSystem(QUADRATIC, potential, damping)
-
-
 run = eqx.filter_jit(solve)
 ZERO = jnp.zeros(())
-
-
-def adaptive(tolerance):
-    return dfx.PIDController(rtol=tolerance, atol=tolerance)
+adaptive = lambda tolerance: dfx.PIDController(rtol=tolerance, atol=tolerance)
+successful = lambda sol: sol.result == dfx.RESULTS.successful
 
 
 def end(*arguments, **options):
     """The solve, and its final state in double precision."""
     sol = run(*arguments, **options)
     return sol, jax.tree.map(lambda x: np.asarray(x, np.float64), last(sol))
-
-
-def successful(sol):
-    return sol.result == dfx.RESULTS.successful
 
 
 def overflow(quick):
@@ -89,7 +74,7 @@ def overflow(quick):
             unequal = dps.DissipativeHamiltonian(QUADRATIC, harmonic, *laws)
             cells = []
             for system in (
-                damped(harmonic, laws[0]),
+                mechanics(harmonic, laws[0]),
                 canonical_form(harmonic, gamma),
                 unequal,
             ):
@@ -126,7 +111,7 @@ def stability(quick):
         table.row(name, *(stability_limit(SCHEMES[name], x) for x in (0.0, 0.5)))
     # Frequencies 1 to 1e4 in one system, at and beyond the limit of the fastest.
     omega = jnp.logspace(0, 4, 5)
-    stiff = conservative(lambda t, q, args: jnp.sum((omega * q) ** 2) / 2)
+    stiff = mechanics(lambda t, q, args: jnp.sum((omega * q) ** 2) / 2)
     y0 = (jnp.ones(5) / omega, jnp.zeros(5))
     table = Table(
         "   frequencies 1 to 1e4, the leapfrog to t = 0.2: energy error",
@@ -177,7 +162,7 @@ def long_times(quick):
     """Rounding errors of the energy, root mean square of 16 orbits, against the same
     steps in compensated doubles."""
     growth, q0 = {}, jnp.linspace(0.3, 1.0, 16, dtype=jnp.float32)
-    system = conservative(pendulum)
+    system = mechanics(pendulum)
     sub = dps.Substeps(LEAPFROG, 1000)
     compensated = dps.Compensated(sub)
     runs = {
@@ -207,7 +192,7 @@ def long_times(quick):
         "   float32 at t = 1e4, h = 0.01", "solver:<24", "error of the step:>17.1%"
     )
     h, t0 = jnp.float32(0.01), jnp.float32(1e4)
-    free = conservative(lambda t, q, args: 0 * jnp.sum(q))
+    free = mechanics(lambda t, q, args: 0 * jnp.sum(q))
     y0 = jnp.zeros(1, jnp.float32), jnp.ones(1, jnp.float32)
     for name, solver, n in (
         ("PresymplecticLeapfrog", LEAPFROG, 1),
@@ -228,9 +213,9 @@ def kepler(quick):
     ts = jnp.linspace(0.0, t1, 20 * orbits + 1)
     series = {}
     for drag in (None, 1e-5):
-        system = conservative(newton)
+        system = mechanics(newton)
         if drag is not None:
-            system = damped(newton, dps.ConstantDamping(drag))
+            system = mechanics(newton, dps.ConstantDamping(drag))
         record = lambda t, y, args, s=system: s.energy(t, y[0], y[1], args)
         density = lambda epsilon, s=system: dps.StepDensityController(
             s, epsilon, dps.DistanceDensity()
@@ -277,7 +262,7 @@ def encounters(quick):
         # From the far end, where softening does not matter.
         q0 = jnp.array([1 + e, 0.0])
         y0 = (q0, jnp.array([0.0, ((1 - e) / (1 + e)) ** 0.5]))
-        system = conservative(newton)
+        system = mechanics(newton)
         start = float(system.energy(ZERO, *y0, soft))
         cells = []
         for control, dt0 in (
@@ -302,8 +287,8 @@ def chaos(quick):
     )
     saveat = dfx.SaveAt(ts=jnp.linspace(100.0, 300.0, 201))
     for name, system, size in (
-        ("Duffing", damped(duffing, dps.ConstantDamping(0.25)), 1),
-        ("Henon-Heiles", conservative(henon_heiles), 2),
+        ("Duffing", mechanics(duffing, dps.ConstantDamping(0.25)), 1),
+        ("Henon-Heiles", mechanics(henon_heiles), 2),
     ):
         q0 = 0.1 * jax.random.normal(key, (n, size))
         p0 = jax.random.normal(jax.random.fold_in(key, 1), (n, size))
@@ -334,7 +319,7 @@ def singular_damping(quick):
         "6. q'' + 3 q'/t + q = 0 to t = 1 in 100 steps: error, or a failure reported",
         *("scheme:<21", "from t0 = 1e-6:>14.1e", "from t0 = 0:>11.1e"),
     )
-    system = damped(harmonic, dps.LogDamping(3.0))
+    system = mechanics(harmonic, dps.LogDamping(3.0))
     solvers: dict[str, Any] = {name: SCHEMES[name].solver for name in FEW}
     solvers["PresymplecticTao"] = dps.PresymplecticTao(5.0)
     for name, solver in solvers.items():
@@ -358,13 +343,13 @@ def non_smooth(quick):
         ("RKN6", RKN6, 0.1, CONSTANT),
         ("Tsit5", dfx.Tsit5(), None, adaptive(1e-6)),
     ):
-        system, y0 = conservative(absolute), (jnp.ones(1), jnp.zeros(1))
+        system, y0 = mechanics(absolute), (jnp.ones(1), jnp.zeros(1))
         t1 = 100 * 4 * 2**0.5
         sol, (q, p) = end(system, solver, 0.0, t1, dt0, y0, controller=control)
         error, steps = abs(q[0]) + p[0] ** 2 / 2 - 1, int(sol.stats["num_steps"])
         table.row("|q|, 100 periods", name, str(steps), abs(error))
     # A ball, thrown back at each contact, in ten bounces.
-    falling = conservative(lambda t, q, args: jnp.sum(q))
+    falling = mechanics(lambda t, q, args: jnp.sum(q))
     event = dfx.Event(height, optx.Newton(rtol=1e-10, atol=1e-10), direction=False)
     for name, solver in (("leapfrog", LEAPFROG), ("RKN4", RKN4)):
         t, y = 0.0, (jnp.ones(1), jnp.zeros(1))
@@ -376,10 +361,10 @@ def non_smooth(quick):
         table.row("ten bounces", name, "", abs(float(t) - 2**0.5 * 19))
     # Damping switched on at t = 1, between two steps and at the end of one.
     law = lambda t: jnp.maximum(t - 1.0, 0.0)
-    system = damped(harmonic, law)
+    system = mechanics(harmonic, law)
     y0 = y = (jnp.ones(1), jnp.zeros(1))
-    always = damped(harmonic, dps.ConstantDamping(1.0))
-    for piece, times in ((conservative(harmonic), [0.0, 1.0]), (always, [1.0, 3.0])):
+    always = mechanics(harmonic, dps.ConstantDamping(1.0))
+    for piece, times in ((mechanics(harmonic), [0.0, 1.0]), (always, [1.0, 3.0])):
         y = reference_end(piece, y, *times)
     for name, count in (("within a step", 50), ("at the end of a step", 49)):
         control = dfx.StepTo(np.linspace(0.0, 3.0, count))
@@ -399,8 +384,8 @@ def broken(quick):
     y0 = (jnp.array([0.3]), jnp.array([-1.0]))
     limited = dfx.PIDController(1e-6, 1e-6, dtmin=1e-9, force_dtmin=False)
     for name, system, base in (
-        ("nan: sqrt of q < 0", conservative(root), LEAPFROG),
-        ("overflow: -q^4", conservative(quartic), LEAPFROG),
+        ("nan: sqrt of q < 0", mechanics(root), LEAPFROG),
+        ("overflow: -q^4", mechanics(quartic), LEAPFROG),
         ("root finder diverges", dps.Hamiltonian(mixed), implicit),
     ):
         cells = []
@@ -415,10 +400,10 @@ def broken(quick):
 
 def prices(quick):
     """Times of a solve with damping or compensated summation over those without."""
-    free = conservative(pendulum)
+    free = mechanics(pendulum)
     systems = {
-        "constant": damped(pendulum, dps.ConstantDamping(0.1)),
-        "1/t": damped(pendulum, dps.LogDamping(3.0, 1.0)),
+        "constant": mechanics(pendulum, dps.ConstantDamping(0.1)),
+        "1/t": mechanics(pendulum, dps.LogDamping(3.0, 1.0)),
         "Compensated": free,
     }
     table = Table(

@@ -10,6 +10,7 @@
 
 import math
 import pathlib
+from functools import partial
 from typing import Any
 
 import diffrax as dfx
@@ -75,20 +76,17 @@ MIXED = dps.Hamiltonian(mixed_energy)
 START = (jnp.array(-3.0), jnp.array(0.0))
 
 
-def bregman(mirror_map):
+def bregman(mirror_map, schemes):
     scaling = dps.PolynomialScaling(2.0, 0.25)
     system = dps.BregmanHamiltonian(mirror_map, least_squares, scaling)
-    return system, (jnp.full(SIZE, 1 / SIZE), jnp.zeros(SIZE)), data(), (1.0, 21.0)
+    y0 = jnp.full(SIZE, 1 / SIZE), jnp.zeros(SIZE)
+    return system, y0, data(), (1.0, 21.0), schemes | ANY, 0.5
 
 
 # System, initial state, arguments, time, schemes that apply, longest stage
 PROBLEMS: dict[str, Any] = {
-    "Bregman, quadratic": (
-        *(*bregman(dps.EuclideanMirror()), SPLIT | QUADRATIC | ANY, 0.5),
-    ),
-    "Bregman, entropic": (
-        *(*bregman(dps.EntropyMirror(simplex=True)), SPLIT | ANY, 0.5),
-    ),
+    "Bregman, quadratic": bregman(dps.EuclideanMirror(), SPLIT | QUADRATIC),
+    "Bregman, entropic": bregman(dps.EntropyMirror(simplex=True), SPLIT),
     "(q² + 1)(p² + 1)/2": (MIXED, START, None, (0.0, 20.0), ANY, 0.05),
 }
 
@@ -100,8 +98,7 @@ def speed(quick, repeats):
         (t0, t1), runs = times, {}
         exact = reference_end(H, y0, t0, t1, args)
         for name, (solver, _, cost) in schemes.items():
-            fixed = H, solver, times, y0
-            run = lambda n, f=fixed, a=args: states(f[0], f[1], f[2], f[3], n, a)
+            run = partial(states, H, solver, times, y0, args=args)
             least = 4 * max(1, (t1 - t0) / longest / cost)
             most = math.log2((3e3 if quick else 6e4) / cost / least)
             n = [round(least * 2 ** (k / 2)) for k in range(math.ceil(2 * most))]

@@ -49,10 +49,7 @@ OURS = [
     *(f"SymmetricMultistep({order})" for order in (8, 10, 12)),
 ]
 # For energies that are not separable; Gauss to rounding, and to two tolerances.
-OTHERS = {
-    name: SCHEMES[name]
-    for name in ("PresymplecticCoupled(4)", "PresymplecticCoupled(6)")
-}
+OTHERS = {x: SCHEMES[x] for x in (f"PresymplecticCoupled({n})" for n in (4, 6))}
 OTHERS |= {
     f"PresymplecticGauss({n}), {name}": Scheme(
         dps.PresymplecticGauss(n, tolerance=tolerance), 2 * n, 7 * n
