@@ -1,5 +1,8 @@
 import gc
+import os
+import subprocess
 import zlib
+from functools import cache
 
 import jax
 import pytest
@@ -24,11 +27,37 @@ def _memory():
     jax.clear_caches()
 
 
+# Of each test with more parameters than these, a sample is run by `make test`, another
+# one for each commit, and all by `make slow`. `@pytest.mark.variants(n)` changes it.
+VARIANTS = 3
+
+
+@cache
+def seed() -> int:
+    """The commit, so that each tries another sample."""
+    run = subprocess.run(
+        ["git", "rev-parse", "--short=7", "HEAD"],
+        cwd=os.path.dirname(__file__),
+        capture_output=True,
+        text=True,
+    )
+    return int(run.stdout, 16) if run.returncode == 0 else 0
+
+
 def pytest_addoption(parser):
     parser.addoption("--part", help="the k-th of n parts of the tests, as k/n")
 
 
 def pytest_collection_modifyitems(config, items):
+    tests: dict = {}
+    for item in items:
+        tests.setdefault(item.nodeid.split("[")[0], []).append(item)
+    rank = lambda item: zlib.crc32(f"{seed()} {item.nodeid}".encode())
+    for first, *others in tests.values():
+        marker = first.get_closest_marker("variants")
+        number = VARIANTS if marker is None else marker.args[0]
+        for item in sorted(others, key=rank)[number - 1 :]:
+            item.add_marker(pytest.mark.slow)
     if config.getoption("part"):
         part, parts = map(int, config.getoption("part").split("/"))
         # Not Python's hash, which differs between the processes.

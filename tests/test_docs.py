@@ -91,6 +91,7 @@ def test_docstring_runs(name, as_user):
     run(blocks, name, {**vars(dfx), **PUBLIC, **usual, "optx": optx})
 
 
+@pytest.mark.variants(1000)
 @pytest.mark.parametrize("page", PAGES, ids=lambda x: str(x.relative_to(ROOT)))
 def test_blocks_say_their_language(page):
     languages = {x["language"] for x in FENCE.finditer(page.read_text())}
@@ -101,6 +102,7 @@ def test_pages_with_figures_have_names_of_their_own():
     assert len({page.stem for page in FIGURES}) == len(FIGURES)
 
 
+@pytest.mark.variants(1000)
 @pytest.mark.parametrize("page", FIGURES, ids=lambda x: x.stem)
 def test_pages_draw_the_pictures_they_show(page):
     text = page.read_text()
@@ -127,6 +129,7 @@ def test_every_public_name_is_in_the_api():
     assert set(shown) == set(PUBLIC)
 
 
+@pytest.mark.variants(1000)
 @pytest.mark.parametrize("name", PUBLIC)
 def test_docstring_is_complete(name):
     value = PUBLIC[name]

@@ -8,10 +8,8 @@ central differences.
 
 import dataclasses
 import itertools
-import os
 import random
 import re
-import subprocess
 from functools import cache, partial
 
 import catalogue
@@ -23,6 +21,7 @@ import jax.tree_util as jtu
 import numpy as np
 import pytest
 from catalogue import claim, offered, Problem, reference, Refused
+from conftest import seed
 from jax.flatten_util import ravel_pytree
 
 import diffrax_presym as dps
@@ -332,30 +331,15 @@ def check_composition(scheme, wrapper):
 
 # Which are tried when.
 
-SAMPLE = 24
-
-
-def seed() -> int:
-    """The commit, so that each tries another sample."""
-    run = subprocess.run(
-        ["git", "rev-parse", "--short=7", "HEAD"],
-        cwd=os.path.dirname(__file__),
-        capture_output=True,
-        text=True,
-    )
-    return int(run.stdout, 16) if run.returncode == 0 else 0
+SAMPLE = 16
 
 
 def rows():
-    table = covering()
-    sample = set(random.Random(seed()).sample(range(len(table)), SAMPLE))
-    marks = lambda i: [] if i in sample else [pytest.mark.slow]
     name = lambda row: " | ".join(map(str, row.values()))
-    return [
-        pytest.param(row, id=name(row), marks=marks(i)) for i, row in enumerate(table)
-    ]
+    return [pytest.param(row, id=name(row)) for row in covering()]
 
 
+@pytest.mark.variants(SAMPLE)
 @pytest.mark.parametrize("row", rows())
 def test_pair(row, record_property):
     with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
