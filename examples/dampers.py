@@ -142,6 +142,7 @@ def main():
     tolerances = 10.0 ** -np.arange(3.0, 9.0, 0.5)
     other = next(solve for solve in map(tsit5, tolerances) if error(solve) <= ERROR)
 
+    assert exact is not None
     data = exact + NOISE * rng.standard_normal(exact.shape)
     solves = {"PresymplecticGauss": gauss, "Tsit5, adaptive": other}
     gradients = {

@@ -1,3 +1,4 @@
+# pyright: reportCallIssue=false, reportArgumentType=false
 """Everything that can be combined: one line an entry.
 
 A system and a law of friction are written twice, once with the package and once in bare

@@ -122,7 +122,7 @@ def test_implicit_schemes_reverse_too(scheme: Scheme):
     "solver",
     [
         dps.Substeps(dps.PresymplecticEuler(), 3),
-        dps.Splitting(dps.SplittingTableau(1, True, False, (0.3, 1.0, 0.7))),
+        dps.Splitting(dps.SplittingTableau(1, True, "any", (0.3, 1.0, 0.7))),
         dps.PresymplecticCoupled(4),
         dps.Compensated(dps.BlanesMoanRKN4()),
     ],

@@ -1,3 +1,4 @@
+# pyright: reportOptionalMemberAccess=false
 """Bregman dynamics: motion, structure and rates, for every mirror map and scaling."""
 
 import dataclasses

@@ -4,7 +4,7 @@ Each message says what was given, what is expected, and what to write instead.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -65,7 +65,7 @@ class Mistake(NamedTuple):
 
 
 def splitting(*fractions, order=2, kick_first=True):
-    return dps.Splitting(dps.SplittingTableau(order, kick_first, False, fractions))
+    return dps.Splitting(dps.SplittingTableau(order, kick_first, "any", fractions))
 
 
 def mistakes(cases):
@@ -164,7 +164,7 @@ def test_backsolve_adjoint():
     @eqx.filter_jit
     def gradient(adjoint):
         def loss(y0):
-            t = map(jnp.array, (0.0, 1.0, 0.01))
+            t: Any = map(jnp.array, (0.0, 1.0, 0.01))
             sol = dfx.diffeqsolve(TERM, LEAPFROG, *t, y0, adjoint=adjoint)
             assert sol.ys is not None
             return jnp.sum(sol.ys[0] ** 2 + sol.ys[1])

@@ -1,3 +1,4 @@
+# pyright: reportOptionalMemberAccess=false
 """Laws of friction as operators, at their singular times and in their limits."""
 
 import functools

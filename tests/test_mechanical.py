@@ -1,3 +1,4 @@
+# pyright: reportAssignmentType=false, reportArgumentType=false, reportReturnType=false
 """Friction of every kind: by degree of freedom, matrix, place and speed."""
 
 import functools

@@ -254,7 +254,7 @@ def test_a_jump_starts_again():
             y, _, _, carry, _ = solver.step(term, t, t + h, y, args, carry, made)
             return (y, carry), None
 
-        start = y, solver.start(as_system(term, before), jnp.asarray(0.0), y)
+        start = y, solver.init(term, jnp.asarray(0.0), jnp.asarray(h), y, before)
         return jax.lax.scan(one, start, jnp.arange(40).astype(float))[0][0]
 
     last = lambda ys: jax.tree.map(lambda x: x[-1], ys)
@@ -368,6 +368,7 @@ def test_bad_input():
             dps.SymmetricMultistep(order)
     with pytest.raises(ValueError, match="TunedRKN6"):
         dps.SymmetricMultistep(4)
+    own = dps.SymmetricMultistep(8)
     relativistic = dps.ConformalHamiltonian(
         dps.RelativisticKinetic(), pendulum, dps.ConstantDamping(0.1)
     )

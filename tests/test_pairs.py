@@ -1,3 +1,4 @@
+# pyright: reportOptionalMemberAccess=false, reportArgumentType=false
 """All pairs of entries of the catalogue: refused, or what is claimed.
 
 A row takes one entry of each list, and each pair of entries is in some row. It is

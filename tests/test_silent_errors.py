@@ -1,3 +1,4 @@
+# pyright: reportOptionalSubscript=false, reportArgumentType=false
 """Wrong numbers with a successful result, each found once from outside."""
 
 import diffrax as dfx

@@ -1,3 +1,4 @@
+# pyright: reportOptionalMemberAccess=false
 """The tabulated schemes: their coefficients, order, structure and cost."""
 
 import functools

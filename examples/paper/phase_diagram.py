@@ -118,7 +118,7 @@ def final_gradients(solver, gammas, hs, eigenvalues, q0, iterations=800):
 
     def final_gradient(gamma, h):
         hamiltonian = dps.ConformalHamiltonian(
-            dps.QuadraticKinetic(), potential, dps.ConstantDamping(gamma), force=force
+            dps.QuadraticKinetic(), potential, dps.ConstantDamping(gamma)
         )
         sol = dfx.diffeqsolve(
             hamiltonian,

@@ -11,7 +11,6 @@ import tqdm
 import diffrax_presym as dps
 from examples.paper._common import Nesterov, parser, report
 from examples.paper.phase_diagram import (
-    force,
     largest_step,
     leapfrog,
     modes,
@@ -30,7 +29,7 @@ SHAPES = {"n / 0.8 rows (script)": 1 / 0.8, "0.8 n rows (text)": 0.8}
 
 
 HAMILTONIAN = dps.ConformalHamiltonian(
-    dps.QuadraticKinetic(), potential, dps.ConstantDamping(GAMMA), force=force
+    dps.QuadraticKinetic(), potential, dps.ConstantDamping(GAMMA)
 )
 
 
