@@ -116,8 +116,6 @@ SCHEMES: dict[str, Callable[..., tuple]] = {
     "leapfrog_BA": leapfrog_BA,
     "suzuki_yoshida_4": triple_jump(leapfrog_AB, 4),
     "suzuki_yoshida_4_BA": triple_jump(leapfrog_BA, 4),
-    "suzuki_yoshida_6": triple_jump(triple_jump(leapfrog_AB, 4), 6),
-    "suzuki_yoshida_8": triple_jump(triple_jump(triple_jump(leapfrog_AB, 4), 6), 8),
     "substeps": repeat(leapfrog_AB, 3),
     "tao": tao(lambda h: 3 * np.pi / 16 / abs(h)),
     "tao_fixed": fixed_tao,

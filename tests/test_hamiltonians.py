@@ -175,11 +175,6 @@ def test_vector_field_is_hamilton_s_equations(hamiltonian, H):
     assert_close(field, (dq, dp), 1e-13)
 
 
-def test_separability_is_known_from_the_type():
-    for name, (hamiltonian, _) in HAMILTONIANS.items():
-        assert bool(hamiltonian.splits) == ("nonseparable" not in name)
-
-
 def test_equal_damping_is_conformal():
     one = dps.DissipativeHamiltonian(QUADRATIC, potential, LOG, LOG)
     two = dps.ConformalHamiltonian(QUADRATIC, potential, LOG)
@@ -248,14 +243,6 @@ def test_masses(mass, p, expected):
     assert_close(velocity, jtu.tree_map(jnp.asarray, expected), 1e-15)
     assert_close(kinetic(T, p), flat(p) @ flat(expected) / 2, 1e-15)
     assert_close(velocity, jax.grad(kinetic, 1)(T, p), 1e-14)
-
-
-def test_the_relativistic_particle_stays_below_the_speed_of_light():
-    for size in (1.0, 1e3, 1e6):
-        speed = jnp.linalg.norm(RELATIVISTIC.velocity(T, size * P))
-        assert speed <= 2.0
-        expected = 2.0 * size / np.sqrt(size**2 + 9 / float(P @ P))
-        np.testing.assert_allclose(speed, expected, 1e-14)
 
 
 ANY = dps.MechanicalSystem(kinetic, potential).kinetic
@@ -354,23 +341,8 @@ def test_a_relativistic_drift_through_friction_that_stops_it(dtype):
 
 
 def test_massless_test_particles_have_a_way():
-    with pytest.raises(ValueError, match="massless test particles"):
+    with pytest.raises(ValueError, match="massless test particles.*ForceField"):
         dps.QuadraticKinetic(jnp.array([1.0, 0.0]))
-    # A body at rest, and a test particle around it.
-    masses = jnp.array([1.0, 0.0])
-
-    def acceleration(t, q, args):
-        apart = q[:, None] - q[None] + jnp.eye(2)[..., None]
-        cubes = jnp.linalg.norm(apart, axis=-1, keepdims=True) ** 3
-        pairs = masses[None, :, None] * (1 - jnp.eye(2))[..., None]
-        return -jnp.sum(pairs * apart / cubes, axis=1)
-
-    system = dps.MechanicalSystem(dps.QuadraticKinetic(), dps.ForceField(acceleration))
-    q0 = jnp.array([[0.0, 0.0], [1.0, 0.0]])
-    v0 = jnp.array([[0.0, 0.0], [0.0, 1.0]])
-    sol = solve(system, dps.TunedRKN6(), 0.0, 2 * np.pi, np.pi / 20, (q0, v0))
-    assert sol.ys is not None
-    assert_close(sol.ys[0][-1], q0, 1e-8)
 
 
 def test_a_euclidean_mirror_takes_masses_as_kinetic_energies_do():

@@ -175,7 +175,8 @@ def _unless_amplified(system: System, span: Span, data: PyTree) -> PyTree:
     friction amplifies rounding errors there beyond half of the digits."""
     if system.friction is None:
         return data
-    friction = lax.stop_gradient(system.friction)
+    arrays, other = eqx.partition(system.friction, eqx.is_array)
+    friction = eqx.combine(lax.stop_gradient(arrays), other)
     grown = friction.amplification(span.t1, -span.h)
     bad = grown > 1 / math.sqrt(friction.precision)
     return jtu.tree_map(lambda x: jnp.where(bad, jnp.nan, x), data)

@@ -130,6 +130,7 @@ def final_gradients(solver, gammas, hs, eigenvalues, q0, iterations=800):
             args=eigenvalues,
             event=dfx.Event(converged),
             max_steps=None,
+            throw=False,  # unstable solves overflow
         )
         assert sol.ys is not None
         return jnp.linalg.norm(force(0.0, sol.ys[0][-1], eigenvalues))
