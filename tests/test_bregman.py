@@ -96,6 +96,7 @@ def system(mirror, scaling="polynomial", f=objective):
 # Equations of motion
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize(
     "mirror, scaling",
     [
@@ -197,6 +198,7 @@ def jacobian(H, solver, basis):
     return jax.jacfwd(one_step)(jnp.zeros(2 * basis.shape[1]))
 
 
+@pytest.mark.variants(1)
 @over("entropy", "simplex", "own")
 def test_form_contracts_with_the_scaling(mirror):
     basis = TANGENT if mirror.name == "simplex" else np.eye(3)
@@ -240,6 +242,7 @@ def beyond_a_corner(t, q, args):
     return jnp.sum((q - jnp.array([[1.5, 0, -0.5]], q.dtype)) ** 2)
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_positions_stay_on_the_simplex(dtype):
     H = dps.BregmanHamiltonian(SIMPLEX, beyond_a_corner, dps.PolynomialScaling(2.0))
@@ -272,6 +275,7 @@ RATES = {
 }
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("rate", RATES)
 def test_objective_falls_like_exp_of_beta(rate):
     H = dps.BregmanHamiltonian(dps.EuclideanMirror(), falling, RATES[rate])
@@ -319,6 +323,7 @@ def failing(mirror_map, solver, q, p, h=0.5):
     return solve(H, solver, 1.0, 1.0 + 4 * h, h, (q, p), throw=False)
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize(
     "mirror_map, q, p",
     [

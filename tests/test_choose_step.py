@@ -177,8 +177,8 @@ def test_single_precision():
     assert choose(system, dps.Strang(), t0, t1, y0, 1e-3).error <= 1
     with pytest.raises(RuntimeError, match="in float32: rounding") as error:
         choose(system, RKN6, t0, t1, y0, 1e-8, ts=jnp.linspace(t0, t1, 81))
-    assert "`Compensated(solver)`" in str(error.value)
-    assert "'jax_enable_x64'" in str(error.value)
+    instead = "`Compensated(solver)`", "'jax_enable_x64'"
+    assert all(x in str(error.value) for x in instead)
 
 
 @pytest.mark.variants(5)

@@ -31,13 +31,13 @@ def test_energies():
 @pytest.mark.parametrize("term", [TERM, DRIVEN], ids=["damped", "driven"])
 def test_energy_error_is_that_of_the_solver(term):
     def error(solver):
-        sol = trajectory(term, solver, 1.0, 11.0, 0.01, Y0, 0.7)
+        sol = trajectory(term, solver, 1.0, 11.0, 1 / 64, Y0, 0.7)
         return diagnostics.energy_error(term, sol[0], sol[1:], 0.7)
 
     fine, coarse = error(dps.BlanesMoanRKN6()), error(dps.PresymplecticEuler())
     assert np.max(np.abs(fine)) < 1e-8
     assert 1e-4 < np.max(np.abs(coarse)) < 1e-1
-    assert fine[0] == 0 and fine.shape in ((1001,), (1002,))
+    assert fine[0] == 0 and fine.shape == (641,)
 
 
 def test_energy_error_of_a_conserved_energy_is_its_change():
@@ -64,8 +64,5 @@ def test_structure_defect():
 def test_convergence_order(solver, order):
     measured = diagnostics.convergence_order(DRIVEN, solver, 1.0, 3.0, Y0, 20, 0.7)
     assert abs(measured - order) < 0.2
-
-
-def test_a_number_of_steps_is_needed():
     with pytest.raises(ValueError, match="steps"):
-        diagnostics.convergence_order(DRIVEN, dfx.Bosh3(), 1.0, 3.0, Y0, 0, 0.7)
+        diagnostics.convergence_order(DRIVEN, solver, 1.0, 3.0, Y0, 0, 0.7)

@@ -430,10 +430,6 @@ HAMILTONIANS = {
         lambda: system(dps.QuadraticKinetic({"a": 1.0})),
         Mistake("got PyTreeDef({'a': *})", "of the structure of `p`", "an array"),
     ),
-    "list of masses": (
-        lambda: system(dps.QuadraticKinetic([1.0, 2.0])),
-        Mistake("got PyTreeDef([*, *])", "of the structure", "`jnp.array(...)`"),
-    ),
     **{
         f"{name} of a relativistic particle": (
             lambda name=name: dps.RelativisticKinetic(**{name: -1.0}),

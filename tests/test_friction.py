@@ -153,6 +153,7 @@ def test_the_gradient_of_the_closed_form_from_rest():
     np.testing.assert_allclose(jax.jacrev(end)(3.0), exact, rtol=0, atol=1e-5)
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("solver", [dps.PresymplecticLeapfrog(), dps.TunedRKN6()])
 def test_a_power_alone_from_rest(solver):
     law = [dps.LogDamping(0.0), dps.PowerDamping(0.5, 0.5)]

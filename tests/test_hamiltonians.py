@@ -186,6 +186,7 @@ def test_equal_damping_is_conformal():
 VELOCITIES = "separable, quadratic T", "separable, relativistic T", "nonseparable"
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("name", [*VELOCITIES, "dissipative, quadratic T"])
 def test_states_by_velocities(name):
     system, _ = HAMILTONIANS[name]
@@ -313,6 +314,7 @@ def test_no_damping_is_the_limit_of_little_damping():
         assert_close(field(law(1e-10)), field(None), 1e-9)
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_a_relativistic_drift_through_friction_that_stops_it(dtype):
     p = jnp.array([0.3, -0.4], dtype)
@@ -341,7 +343,7 @@ def test_a_relativistic_drift_through_friction_that_stops_it(dtype):
 
 
 def test_massless_test_particles_have_a_way():
-    with pytest.raises(ValueError, match="massless test particles.*ForceField"):
+    with pytest.raises(ValueError, match=r"massless test particles.*ForceField"):
         dps.QuadraticKinetic(jnp.array([1.0, 0.0]))
 
 
@@ -353,6 +355,7 @@ def test_a_euclidean_mirror_takes_masses_as_kinetic_energies_do():
                 fn(q[:, :2])
 
 
+@pytest.mark.slow
 def test_pairwise_potential():
     masses, q = jnp.array([1.0, 2.0, 0.5, 3.0]), jnp.arange(12.0).reshape(4, 3) ** 1.3
     i, j = np.triu_indices(4, 1)

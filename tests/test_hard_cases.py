@@ -80,7 +80,7 @@ def test_no_drift_in_1e5_steps():
 @pytest.mark.parametrize(
     "solver",
     [LEAPFROG, dps.Suzuki4(), dps.BlanesMoan4(), RKN4, dps.BlanesMoanRKN6()],
-    ids=["leapfrog", "suzuki", "S6", "RKN4", "RKN6"],
+    ids=lambda solver: type(solver).__name__,
 )
 def test_singular_damping_from_its_start(solver, t0):
     system = damped(harmonic, dps.LogDamping(3.0))
@@ -103,7 +103,6 @@ def test_stages_before_the_start_are_reported():
         (np.repeat([0.0, 1.0], 4), None),
         (np.logspace(-6, 6, 9), np.logspace(-6, 6, 9)),
     ],
-    ids=["condition", "rank", "masses"],
 )
 def test_conditioning(stiffness, mass):
     # The modes are independent: the slow ones are as accurate as alone.

@@ -153,6 +153,7 @@ def test_schemes_that_would_lose_their_order_name_those_that_do_not(name):
 # Structure.
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("name", LINEAR)
 def test_phase_volume_contracts_by_the_trace(name):
     solver = dps.TunedRKN6() if name == "matrix" else dps.PresymplecticLeapfrog()
@@ -171,6 +172,7 @@ def test_the_trace_by_hand():
         volume_defect(system("place"), dps.BlanesMoan4(), 0.0, 0.1, Y0)
 
 
+@pytest.mark.slow
 def test_a_kick_with_friction_by_place_contracts_by_the_friction_there():
     q, p = Y0
     local, force = system("place, matrix"), jnp.ones(3)
@@ -350,6 +352,7 @@ def test_gradients_at_equal_eigenvalues():
     np.testing.assert_allclose(central, np.sum(first * direction), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_vmap_over_coefficients():
     one = lambda c: end_of(c, dps.BlanesMoanRKN4(), dfx.RecursiveCheckpointAdjoint())
     many = jnp.stack([C, 2 * C, C.T])
@@ -380,21 +383,12 @@ def test_copies_that_part_are_not_a_success():
 # Energy.
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(
-            "sum",
-            marks=pytest.mark.xfail(
-                strict=True,
-                raises=jax.errors.TracerBoolConversionError,
-                reason="RayleighDamping.parts compares beta while it is traced",
-            ),
-        ),
-        "wind",
-        pytest.param("all by place", marks=pytest.mark.slow),
-    ],
-)
+TRACED = pytest.mark.xfail(strict=True, reason="RayleighDamping compares a traced beta")
+SUM = pytest.param("sum", marks=TRACED)
+
+
+@pytest.mark.parametrize("name", [SUM, "wind", "all by place"])
+@pytest.mark.variants(1)
 def test_energy_balance(name):
     solver = dps.BlanesMoan6() if name in LOCAL else dps.TunedRKN6()
     saveat = dfx.SaveAt(t0=True, steps=True)
@@ -404,6 +398,7 @@ def test_energy_balance(name):
     assert np.max(np.abs(energy_error(system(name), ts, ys))) < 1e-7
 
 
+@pytest.mark.slow
 def test_power_lost():
     term = dps.MechanicalSystem(DENSE, harmonic, dps.ViscousDamping(C))
     saveat = dfx.SaveAt(ts=jnp.linspace(0, 2, 201))

@@ -52,7 +52,6 @@ def last(ys):
         (LEAPFROG, dps.ArclengthDensity(KEPLER)),
         (LEAPFROG, lambda t, y, args: jnp.sum(y[0] ** 2) + 0.1),
     ],
-    ids=["distance", "arclength", "own"],
 )
 def test_a_solve_goes_back_the_way_it_came(solver, density):
     controller = control(0.05, density)
