@@ -173,14 +173,7 @@ def work_precision(
                 measured.append((name, error, solution.steps, level, solve))
             if error < goal:
                 break
-    calls = [(solve, setting) for *_, setting, solve in measured]
-    runs = [
-        WorkPrecisionRun(name, error, seconds, steps, setting)
-        for (name, error, steps, setting, _), seconds in zip(
-            measured, _medians(calls, repeats), strict=True
-        )
-    ]
-    return WorkPrecision(tuple(runs), reference)
+    return WorkPrecision(_timed(measured, repeats), reference)
 
 
 def _ladder(max_steps: int):
@@ -221,6 +214,16 @@ def _agreed(finest: Mapping[str, Solution], tolerance) -> str:
         for name, solution in finest.items()
     }
     return max(finest, key=lambda name: (votes[name], finest[name].steps))
+
+
+def _timed(measured: list[tuple], repeats: int) -> tuple[WorkPrecisionRun, ...]:
+    calls = [(solve, setting) for *_, setting, solve in measured]
+    return tuple(
+        WorkPrecisionRun(name, error, seconds, steps, setting)
+        for (name, error, steps, setting, _), seconds in zip(
+            measured, _medians(calls, repeats), strict=True
+        )
+    )
 
 
 def _medians(calls: list[tuple[Solve, float]], repeats: int) -> list[float]:
