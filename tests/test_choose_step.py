@@ -71,7 +71,6 @@ CASES = {
 }
 
 
-@pytest.mark.variants(4)
 @pytest.mark.parametrize("name", CASES)
 def test_the_tolerance_is_reached(name):
     (system, solver, t0, t1, y0), options, rtol, atol, within = CASES[name]
@@ -281,7 +280,7 @@ def test_steps_between_kinks_keep_the_order(adjoint, t0, t1):
 
 
 def test_steps_between_kinks_are_chosen_and_differentiated():
-    options = {"ts": jnp.array([2.0, 9.0])} | BETWEEN
+    options: dict[str, Any] = {"ts": jnp.array([2.0, 9.0])} | BETWEEN
     problem = TABLE, RKN4, 0.0, 10.0, Y0, 1e-7
     push = jnp.asarray(PUSH)
     step = choose(*problem, args=push, **options)

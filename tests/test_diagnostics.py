@@ -28,6 +28,7 @@ def test_energies():
     assert_close(diagnostics.canonical_energy(TERM, ts, ys), canonical, 1e-15)
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("term", [TERM, DRIVEN], ids=["damped", "driven"])
 def test_energy_error_is_that_of_the_solver(term):
     def error(solver):
