@@ -14,7 +14,7 @@ PYTEST = -m pytest -q -n $(WORKERS) --dist worksteal
 EXAMPLES := $(sort $(filter-out examples/_%,$(wildcard examples/*.py)))
 # The experiments of the paper share code, so they are run as modules.
 PAPER := $(notdir $(basename $(filter-out examples/paper/_%,$(wildcard examples/paper/*.py))))
-BENCHMARKS := against_loop compile_time schemes stability tuning work_precision choose_step batches \
+BENCHMARKS := against_loop compile_time schemes tuning work_precision choose_step batches \
 	nonseparable gauss multistep friction hard_cases gradients limits
 
 # Figures are saved to files, without a display.

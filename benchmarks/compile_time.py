@@ -121,14 +121,12 @@ def in_a_process(*task):
 
 def compared(repeats, *task):
     """For each number of a task: the medians of ours, Tsit5's, and of the ratios."""
-    rounds = [[in_a_process(side, *task) for side in SIDES] for _ in range(repeats)]
+    sides = "ours", "Tsit5"
+    rounds = [[in_a_process(side, *task) for side in sides] for _ in range(repeats)]
     for i in range(len(rounds[0][0])):
         ours, theirs = ([both[k][i] for both in rounds] for k in (0, 1))
         ratios = [a / b for a, b in zip(ours, theirs, strict=True)]
         yield [statistics.median(x) for x in (ours, theirs, ratios)]
-
-
-SIDES = ("ours", "Tsit5")
 
 
 def main():

@@ -34,6 +34,7 @@ def pages_with_figures():
         page: f"{prefix}_{page.stem}.png"
         for folder, prefix in FOLDERS.items()
         for page in sorted((DOCS / folder).glob("*.md"))
+        if "savefig" in page.read_text()
     }
 
 

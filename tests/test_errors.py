@@ -164,7 +164,6 @@ def test_backsolve_adjoint():
     assert_close(backsolve, _gradient(dfx.RecursiveCheckpointAdjoint()), 1e-4)
 
 
-@pytest.mark.xfail(strict=True, reason="`init` checks the state before the term")
 def test_backsolve_adjoint_with_the_same_solver():
     with pytest.raises(ValueError) as error:
         _gradient(dfx.BacksolveAdjoint())

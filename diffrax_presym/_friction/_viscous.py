@@ -5,6 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import ArrayLike, PyTree
 
@@ -205,7 +206,7 @@ class RayleighDamping(AbstractFriction):
             return Parts(forces=(self,))
         needs_mass(mechanics, "RayleighDamping")
         of_mass = Linear(LinearScale(), self.alpha)
-        if not isinstance(self.beta, Tracer) and bool(self.beta == 0):
+        if not isinstance(self.beta, Tracer) and not np.any(np.asarray(self.beta)):
             return Parts((of_mass,))
         stiffness = self.stiffness
         if stiffness is None:

@@ -25,8 +25,12 @@ class StepsBetween(dfx.AbstractStepSizeController):
     !!! example
 
         ```python
+        times = jnp.array([0.0, 3.0, 4.0, 10.0])
+        forces = jnp.array([0.0, 1.0, -1.0, 0.0])
+        force = ForceField(lambda t, q, args: jnp.interp(t, times, forces) - q)
         sol = diffeqsolve(
-            system, TunedRKN6(), t0, t1, dt0, y0,
+            MechanicalSystem(QuadraticKinetic(), force),
+            *(TunedRKN6(), 0.0, 10.0, 1.0, (jnp.ones(1), jnp.zeros(1))),
             stepsize_controller=StepsBetween(times), adjoint=FixedStepAdjoint(),
         )
         ```

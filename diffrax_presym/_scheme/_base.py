@@ -12,7 +12,7 @@ from jaxtyping import Array, PyTree
 from .._interpolation import HermiteInterpolation, inner_points
 from .._misc import all_finite, cast_to, State, tree_scale
 from .._system._base import check_state
-from .._system._bound import bind, NONFINITE, System
+from .._system._bound import bind, NONFINITE, System, unwrap
 from ._engine import first_failure, forward, Moves, prepare, Result, Span
 from ._estimate import no_error_estimate
 
@@ -76,6 +76,7 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver):
         or would lose its order."""
 
     def init(self, terms, t0, t1, y0, args) -> PyTree:
+        unwrap(terms)  # An error if it is another term.
         check_state(y0)
         system = bind(terms, args, y0)
         return self.scheme(system).start(system, system.time(t0), y0)

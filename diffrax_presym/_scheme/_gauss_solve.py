@@ -179,7 +179,8 @@ def contract(g, y: Slopes) -> Slopes:
             new = tree_sub(tree_sum(x, g(x)), b)
             change, size = largest(tree_sub(new, x)), largest(new)
             stalled = jnp.where(change < least, 0, stalled + 1)
-            going = (change > eps / 8 * size) & (stalled < 3)
+            # A contraction that rotates may grow for some iterations.
+            going = (change > eps / 8 * size) & (stalled < 10)
             return new, going, jnp.minimum(change, least), stalled, count + 1
 
         start = tree_scale(-1, b)

@@ -105,7 +105,7 @@ def choose_step(
                 adjoint=FixedStepAdjoint(), max_steps=None,
             )
 
-        step = choose_step(solve, 0.0, 20.0, rtol=1e-6, atol=1e-6)
+        step = choose_step(solve, 0.0, 20.0, rtol=1e-4, atol=1e-4)
         sol = solve(step.dt0)
         ```
 

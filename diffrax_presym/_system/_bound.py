@@ -152,13 +152,19 @@ def _stored(force: PyTree, t: Time) -> PyTree:
 
 def bind(terms: PyTree, args: PyTree, y: State) -> System:
     """The system of the term that `diffeqsolve` passes to a solver."""
+    term, direction = unwrap(terms)
+    return System(term, args, direction, y)
+
+
+def unwrap(terms: PyTree) -> tuple[AbstractSystem, Any]:
+    """The system, and the direction of time; `ValueError` if it is another term."""
     term, direction = terms, 1
     # Diffrax wraps a term to solve backwards in time. The wrapper is private, so it is
     # recognised by its two attributes.
     if hasattr(term, "term") and hasattr(term, "direction"):
         term, direction = term.term, term.direction
     if isinstance(term, AbstractSystem):
-        return System(term, args, direction, y)
+        return term, direction
     if type(term).__name__ == "AdjointTerm":
         raise ValueError(
             "`BacksolveAdjoint()` solves the adjoint equations, which are not "

@@ -104,7 +104,9 @@ def work_precision(
             )
 
         solves = {"TunedRKN6": solve_by(TunedRKN6()), "Dopri8": solve_by(dfx.Dopri8())}
-        result = work_precision(solves, 0.0, 20.0, rtol=1e-6, atol=1e-6)
+        result = dps.diagnostics.work_precision(
+            solves, 0.0, 20.0, rtol=1e-4, atol=1e-4, decades=1
+        )
         print(result, result.fastest().name)
         ```
 
