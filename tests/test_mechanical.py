@@ -383,9 +383,6 @@ def test_copies_that_part_are_not_a_success():
 # Energy.
 
 
-"sum" = pytest.param("sum")
-
-
 @pytest.mark.parametrize("name", ["sum", "wind", "all by place"])
 @pytest.mark.variants(1)
 def test_energy_balance(name):
