@@ -29,7 +29,7 @@ def _memory():
 
 # Of each test with more parameters than these, a sample is run by `make test`, another
 # one for each commit, and all by `make slow`. `@pytest.mark.variants(n)` changes it.
-VARIANTS = 3
+VARIANTS = 2
 
 
 @cache

@@ -15,7 +15,6 @@ from helpers import (
     each,
     flat,
     harmonic,
-    IMPLICIT,
     mixed_energy,
     oscillator,
     pendulum,
@@ -284,24 +283,6 @@ def test_jumps_of_the_force(scheme: Scheme):
     assert_close(jtu.tree_map(lambda y: y[-1], ys), expected, 1e-12)
 
 
-@pytest.mark.slow
-@each(CARRIES)
-def test_half_steps_estimate_the_error(scheme: Scheme, exact):
-    tolerance = 1e-3 if scheme.order == 1 else 1e-5
-
-    @eqx.filter_jit
-    def adapt(y0):
-        return dfx.diffeqsolve(
-            *(TERM, dfx.HalfSolver(scheme.solver), 1.0, 2.0, 0.01, y0, ARGS),
-            stepsize_controller=dfx.PIDController(rtol=tolerance, atol=tolerance),
-        )
-
-    sol = adapt(Y0)
-    assert_close(jtu.tree_map(lambda y: y[-1], sol.ys), exact(2.0), 20 * tolerance)
-    # The steps are adaptive, not those of `dt0`.
-    assert sol.stats["num_accepted_steps"] != 100
-
-
 # States of several structures
 
 
@@ -497,19 +478,6 @@ MIXED = dps.ConformalHamiltonian(energy=mixed_energy, damping=dps.ConstantDampin
 IMPLICIT_Y0 = (jnp.array([0.5, -0.3]), jnp.array([0.2, 0.4]))
 
 
-@pytest.mark.slow
-@each(IMPLICIT)
-def test_implicit_schemes_solve(scheme: Scheme):
-    end = lambda solver, dt0, **kwargs: dfx.diffeqsolve(
-        *(MIXED, solver, 0.0, 1.0, dt0, IMPLICIT_Y0), **kwargs
-    )
-    sol = end(scheme.solver, STEP)
-    assert sol.result == dfx.RESULTS.successful
-    controller = dfx.PIDController(rtol=1e-10, atol=1e-10)
-    exact = end(dfx.Tsit5(), STEP, stepsize_controller=controller)
-    assert_close(sol.ys, exact.ys, accuracy(scheme))
-
-
 # Its implicit equations have no real solution for the state and step size below.
 HOPELESS = dps.Hamiltonian(lambda t, q, p, args: jnp.sum(q**2 * p + q * p**2))
 
@@ -580,50 +548,7 @@ SPLITTINGS = [
 ]
 
 
-@each(SPLITTINGS)
-def test_splittings_go_on_and_back(scheme: Scheme, exact):
-    y, state = go(scheme, 1.0, 3.0, Y0)
-    halfway, carried = go(scheme, 1.0, 2.0, Y0)
-    assert_close(halfway, exact(2.0), accuracy(scheme))
-    assert_close(go(scheme, 2.0, 3.0, halfway, carried), (y, state), 0)
-    assert_close(go(scheme, 3.0, 1.0, y)[0], Y0, 1e-12)
-
-
-@each(SPLITTINGS)
-def test_substeps_of_splittings_are_steps(scheme: Scheme):
-    times = jnp.array([1.0, 1.125, 1.25, 1.375, 1.5])
-    whole = march(TERM, dps.Substeps(scheme.solver, 2), times[::2], Y0)
-    parts = march(TERM, scheme.solver, times, Y0)
-    assert_close(whole, jtu.tree_map(lambda y: y[::2], parts), 1e-14)
-
-
 # Adjoints
-
-
-@pytest.mark.slow
-@each(SPLITTINGS[:1])
-def test_adjoints_agree(scheme: Scheme):
-    def end(gamma, adjoint):
-        damping = dps.ConstantDamping(gamma)
-        term = dps.ConformalHamiltonian(KINETIC, swing, damping)
-        sol = dfx.diffeqsolve(
-            *(term, scheme.solver, 0.0, 1.0, 0.125, Y0, ARGS),
-            adjoint=adjoint,
-            max_steps=8,
-        )
-        assert sol.ys is not None
-        return jnp.sum(sol.ys[0] ** 2)
-
-    @jax.jit
-    def slopes(gamma):
-        checkpoints = jax.grad(end)(gamma, dfx.RecursiveCheckpointAdjoint())
-        direct = jax.grad(end)(gamma, dfx.DirectAdjoint())
-        forward = jax.jacfwd(end)(gamma, dfx.ForwardMode())
-        return jnp.stack([checkpoints, direct, forward])
-
-    found = slopes(jnp.array(0.3))
-    assert abs(found[0]) > 1e-2
-    assert_close(found, jnp.full(3, found[0]), 1e-13)
 
 
 # A jump of a force that is not constant

@@ -110,54 +110,6 @@ def test_event_time_is_differentiable(solver, adjoint):
         assert abs(gradient[i] - (time(x + step) - time(x - step)) / (2 * e)) < 1e-7
 
 
-def restart(sol, solver, **kwargs):
-    """From the event to t = 4."""
-    t, q, p = last(sol)
-    again = dfx.diffeqsolve(
-        system(),
-        solver,
-        t0=t,
-        t1=jnp.array(4.0),
-        dt0=jnp.array(0.01),
-        y0=(q, p),
-        **kwargs,
-    )
-    return jax.tree.map(lambda y: y[-1], again.ys)
-
-
-@pytest.fixture(scope="module")
-def stopped():
-    saveat = dfx.SaveAt(t1=True, solver_state=True)
-    return swing(dps.PresymplecticLeapfrog(), 0.31, saveat=saveat)
-
-
-def test_saved_solver_state_belongs_to_the_end_of_the_step(stopped):
-    t, q, p = last(stopped)
-    force_here = system().force(t, q, p)
-    assert abs(stopped.solver_state - force_here) > 1e-3
-
-
-def test_a_restart_from_the_state_alone_is_fresh(stopped):
-    solver = dps.PresymplecticLeapfrog()
-    t, q, p = last(stopped)
-    sol = dfx.diffeqsolve(
-        system(),
-        dfx.Dopri8(),
-        t0=t,
-        t1=jnp.array(4.0),
-        dt0=jnp.array(0.01),
-        y0=(q, p),
-    )
-    fresh = restart(stopped, solver)
-    assert_close(fresh, jax.tree.map(lambda y: y[-1], sol.ys), 2e-5)
-    # Reusing the stale force is wrong; with `made_jump` it is recomputed.
-    state = stopped.solver_state
-    jumped = restart(stopped, solver, solver_state=state, made_jump=jnp.array(True))
-    assert_close(jumped, fresh, 1e-14)
-    stale = restart(stopped, solver, solver_state=state)
-    assert abs(stale[0] - fresh[0]) > 1e-5
-
-
 # Properties of every scheme
 
 OMEGA = np.sqrt(1 - GAMMA**2 / 4)
@@ -247,15 +199,6 @@ def test_events_backwards_in_time():
     assert abs(t) < 1e-7 and abs(q - 1) < 1e-7
 
 
-def test_events_under_vmap():
-    solver, q0 = dps.PresymplecticLeapfrog(), jnp.array([0.5, 1.5, 2.5])
-    time = lambda q0: last(swing(solver, 0.1, q0=q0))[0]
-    together = jax.jit(jax.vmap(time))(q0)
-    assert np.all(np.diff(together) > 0.1)  # larger amplitudes take longer
-    for t, q in zip(together, q0, strict=True):
-        assert abs(t - time(q)) < 1e-13
-
-
 # Continuation, for each kind of solver state: the force of a nested scheme, that of a
 # splitting, a copy.
 
@@ -299,6 +242,7 @@ def ending(sol):
 START = jnp.array(0.0), jnp.array(4.0), (jnp.array(1.5), jnp.array(0.0))
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("solver", GOING_ON.values(), ids=GOING_ON)
 def test_where_a_solver_state_belongs(solver):
     whole = let_go(solver, *START)

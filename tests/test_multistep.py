@@ -145,43 +145,6 @@ def test_one_evaluation_per_step():
     assert numbers[1] - numbers[0] == 40
 
 
-# Reversal and gradients
-
-
-@pytest.mark.parametrize("law", ("none", "logarithmic"))
-def test_gradients_by_reversal_are_those_by_checkpoints(law):
-    hamiltonian = system(LAWS[law])
-    saveat = dfx.SaveAt(ts=jnp.array([1.05, 2.0, 4.07]), t1=True)
-
-    @eqx.filter_jit
-    def gradients(adjoint):
-        def loss(inputs):
-            y0, args = inputs
-            ys = ends(
-                *(hamiltonian, dps.SymmetricMultistep(8), 1.0, 5.0, 0.1, y0, args),
-                saveat=saveat,
-                adjoint=adjoint,
-            )
-            return jnp.sum(ys[0] ** 2) + jnp.sum(ys[0] * ys[1])
-
-        return jax.value_and_grad(loss)((Y0, ONE))
-
-    by_reversal = gradients(dps.FixedStepAdjoint())
-    assert_close(by_reversal, gradients(dps.FixedStepAdjoint()), 1e-10)
-
-
-def test_gradient_is_that_of_finite_differences():
-    hamiltonian, solver = system(LAWS["constant"]), dps.SymmetricMultistep(12)
-
-    def loss(args):
-        adjoint = dps.FixedStepAdjoint()
-        ys = ends(hamiltonian, solver, 0.0, 4.0, 0.1, Y0, args, adjoint=adjoint)
-        return jnp.sum(ys[0] * ys[1])
-
-    up, down = loss(ONE + 1e-5), loss(ONE - 1e-5)
-    assert_close(jax.grad(loss)(ONE), (up - down) / 2e-5, 1e-8)
-
-
 # Steps that are not equal
 
 
@@ -198,6 +161,7 @@ def test_a_change_of_the_step_starts_again():
     assert_close(uneven, exact, 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrap", [lambda x: x, dps.Compensated])
 def test_a_change_of_the_step_is_not_undone(wrap):
     """What is known of the steps before it is dropped, so that reversal is refused."""
@@ -278,7 +242,7 @@ def test_events():
 # Everything else
 
 
-@pytest.mark.parametrize("law", ("none", "mixed"))
+@pytest.mark.parametrize("law", ("none", pytest.param("mixed", marks=pytest.mark.slow)))
 def test_between_steps_the_error_is_that_at_steps(law):
     hamiltonian, solver = system(LAWS[law]), dps.SymmetricMultistep(12)
     saveat = dfx.SaveAt(ts=jnp.linspace(1.0, 6.0, 1 + 160))
@@ -299,11 +263,11 @@ def test_between_steps_the_error_is_that_at_steps(law):
 
 
 def test_vmap():
-    hamiltonian, solver = system(LAWS["logarithmic"]), dps.SymmetricMultistep(8)
+    solver = dps.SymmetricMultistep(8)
 
     def end(scale, t0, gamma):
         y0 = jax.tree.map(lambda x: scale * x, Y0)
-        one = eqx.tree_at(lambda h: h.damping.gamma, hamiltonian, gamma)
+        one = system(dps.LogDamping(gamma, 2.0))
         # Some in the batch are at the start while others are not.
         return ends(one, solver, t0, 4.0, 0.1, y0, ONE)
 
@@ -312,28 +276,6 @@ def test_vmap():
     for i in range(2):
         one = end(*(x[i] for x in inputs))
         assert_close(jax.tree.map(lambda x, i=i: x[i], batch), one, 1e-13)
-
-
-def test_float32():
-    to_single = lambda x: x.astype(jnp.float32) if eqx.is_array(x) else x
-    single = lambda x: jax.tree.map(to_single, x)
-    hamiltonian, solver = single(system(LAWS["constant"])), dps.SymmetricMultistep(8)
-    times: Any = single((jnp.array(0.0), jnp.array(8.0), jnp.array(0.1)))
-    ys = ends(hamiltonian, solver, *times, single(Y0), single(ONE))
-    assert all(x.dtype == jnp.float32 for x in ys)
-    exact = ends(system(LAWS["constant"]), EXACT, 0.0, 8.0, 0.05, Y0, ONE)
-    assert_close(ys, exact, 3e-6)
-
-
-def test_wrappers():
-    hamiltonian, solver = system(LAWS["constant"]), dps.SymmetricMultistep(8)
-    args = 0.0, 4.0, 0.1, Y0, ONE
-    plain = ends(hamiltonian, solver, *args)
-    for wrapped in (dps.Compensated(solver), dps.Substeps(solver, 1)):
-        assert_close(ends(hamiltonian, wrapped, *args), plain, 1e-14)
-    substeps = dps.Substeps(solver, 2)
-    twice = ends(hamiltonian, substeps, 0.0, 4.0, 0.2, Y0, ONE)
-    assert_close(twice, plain, 1e-13)
 
 
 def energy_error(order, eccentricity, per_orbit, orbits):
@@ -373,10 +315,10 @@ def test_bad_input():
         dps.RelativisticKinetic(), pendulum, dps.ConstantDamping(0.1)
     )
     for hamiltonian in (relativistic, dps.Hamiltonian(lambda t, q, p, args: p @ p)):
-        with pytest.raises(ValueError, match="constant mass"):
+        with pytest.raises(ValueError, match="a known mass"):
             solve(hamiltonian, own, 0.0, 1.0, 0.1, Y0)
     with pytest.raises(ValueError, match="unequal steps"):
-        dps.Suzuki4(own)
+        solve(system(None), dps.Suzuki4(own), 0.0, 1.0, 0.1, Y0, ONE)
     with pytest.raises((ValueError, RuntimeError), match="error estimate"):
         controller = dfx.PIDController(rtol=1e-6, atol=1e-6)
         args = system(None), own, 0.0, 1.0, 0.1, Y0, ONE

@@ -95,35 +95,6 @@ def test_wrappers_keep_what_the_scheme_has(wrap):
 @pytest.mark.parametrize(
     "solver",
     [
-        dps.PresymplecticEuler(),
-        dps.Suzuki4(dps.Compensated(dps.PresymplecticLeapfrog())),
-        *(
-            pytest.param(solver, marks=pytest.mark.slow)
-            for solver in (
-                dps.PresymplecticEuler(),
-                dps.Compensated(dps.PresymplecticTao(5.0)),
-                dps.Compensated(dps.Suzuki4()),
-            )
-        ),
-    ],
-    ids=lambda solver: type(solver).__name__,
-)
-def test_gradients_by_reversal_through_wrappers(solver):
-    def loss(y0, adjoint):
-        sol = dfx.diffeqsolve(DAMPED, solver, 0.5, 1.5, 0.125, y0, adjoint=adjoint)
-        assert sol.ys is not None
-        return jnp.sum(jnp.sin(sol.ys[0])) + jnp.sum(sol.ys[1] ** 2)
-
-    by_reversal, by_checkpoints = (
-        jax.grad(loss)(Y0, adjoint)
-        for adjoint in (dps.FixedStepAdjoint(), dfx.RecursiveCheckpointAdjoint())
-    )
-    assert_close(by_reversal, by_checkpoints, 1e-13)
-
-
-@pytest.mark.parametrize(
-    "solver",
-    [
         dps.PresymplecticLeapfrog(),
         dps.Substeps(dps.Strang(), 2),
         pytest.param(dps.PresymplecticTao(5.0), marks=pytest.mark.slow),

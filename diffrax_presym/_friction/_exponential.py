@@ -100,9 +100,11 @@ def exponentials(
 
     By scaling and squaring, with powers of the matrix that all times share. The change
     is computed without cancellation. Both are NaN if the matrix times the longest time
-    has a norm beyond about 3e4, or is not finite.
+    has a norm beyond about 3e4, and for a time that is not finite.
     """
     times = cast_to(times, matrix)
+    known = jnp.isfinite(times)
+    times = jnp.where(known, times, 0)
     longest = jnp.max(jnp.abs(times))
     norm = jnp.max(jnp.sum(jnp.abs(matrix), axis=-2)) * longest
     halvings = jnp.ceil(jnp.log2(jnp.maximum(2 * lax.stop_gradient(norm), 1)))
@@ -135,7 +137,8 @@ def exponentials(
         double, (change, mean), np.arange(_SQUARINGS, dtype=z.dtype)
     )
     length = jnp.expand_dims(times, range(1, mean.ndim))
-    valid = lambda x: jnp.where(solvable, x, jnp.nan)
+    known = jnp.expand_dims(known, range(1, mean.ndim))
+    valid = lambda x: jnp.where(solvable & known, x, jnp.nan)
     return valid(change), valid(length * mean)
 
 

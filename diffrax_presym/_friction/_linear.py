@@ -4,7 +4,7 @@ import functools
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Bool, PyTree, Shaped
 
 from .._misc import Scalar, Time
 from ._log_scale import (
@@ -44,6 +44,10 @@ class LinearFriction(eqx.Module):
         is not known in closed form."""
         return Effects([part.prepare(t, h, order) for part in self.parts])
 
+    def prepare_decays(self, t: Shaped[Array, " spans"], h: Array) -> Effects:
+        """What decays over several spans need, in a form to be applied many times."""
+        return Effects([part.prepare_decays(t, h) for part in self.parts])
+
     def fix(self, effects: Effects) -> Effects:
         """What was prepared for many spans at once, to be applied many times."""
         rows = zip(self.parts, effects.leaves, strict=True)
@@ -61,7 +65,7 @@ class LinearFriction(eqx.Module):
 
     def decay(self, effects: Effects, p: PyTree) -> PyTree:
         """The change of `p` by friction alone."""
-        return self.flow(effects, p)[0]
+        return self.ravel.unflatten(self._each("decay", effects, p))
 
     def respond(self, effects: Effects, force: PyTree) -> PyTree:
         """The momentum left by a constant force."""

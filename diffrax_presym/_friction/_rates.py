@@ -67,9 +67,9 @@ class Ravel(eqx.Module):
 class Effect(NamedTuple):
     """What friction does to a leaf: numbers for its entries, or matrices."""
 
-    change: Array
-    carried: Array
-    responded: Array
+    change: Array  # of a momentum by decay
+    carried: Any = None  # the integral of a decaying momentum
+    responded: Any = None  # the momentum left by a constant force
 
 
 class EntryFriction(eqx.Module):
@@ -111,8 +111,15 @@ class EntryFriction(eqx.Module):
         ]
         return Effect(expm1(-total(lambda x: x.x, False)), *sums)
 
+    def prepare_decays(self, t: Array, h: Array) -> Effect:
+        increments = jax.vmap(self.increment)(t, h)
+        return Effect(expm1(-increments))
+
     def fix(self, effect: Any) -> Effect:
         return effect
+
+    def decay(self, effect: Effect, p: Array) -> Array:
+        return cast_to(effect.change, p) * p
 
     def flow(self, effect: Effect, p: Array) -> tuple[Array, Array]:
         change, carried, _ = effect
@@ -233,16 +240,29 @@ class CoupledFriction(eqx.Module):
     def prepare(self, t: Time, h: Time, order: int) -> Exponents:
         return self.log_scale.exponents(t, h, order)
 
-    def fix(self, exponents: Any) -> Effect | Exponents:
-        if not (self.is_autonomous and isinstance(self.rate, MatrixRate)):
-            return exponents
-        x = exponents.x
+    def prepare_decays(self, t: Array, h: Array) -> Effect | Exponents:
+        if isinstance(self.rate, ProductRate):
+            return jax.vmap(lambda t, h: self.prepare(t, h, 1))(t, h)
+        x = jax.vmap(self.log_scale.increment)(t, h)
+        return Effect(exponentials(cast_to(self.rate.dense(x), x), x)[0])
+
+    def fix(self, effect: Any) -> Effect | Exponents:
+        if isinstance(effect, Effect):
+            return effect
+        if not self.is_autonomous or isinstance(self.rate, ProductRate):
+            return effect
+        x = effect.x
         matrix = cast_to(self.rate.dense(x), x)
         change, carried = (
             y.reshape(*x.shape, *matrix.shape)
             for y in exponentials(matrix, jnp.ravel(x))
         )
         return Effect(change, carried, carried)
+
+    def decay(self, effect: Effect | Exponents, p: Array) -> Array:
+        if isinstance(effect, Effect):
+            return matvec(cast_to(effect.change, p), p)
+        return exponential_products(self.rate, cast_to(effect.x, p), p)[0]
 
     def flow(self, effect: Effect | Exponents, p: Array) -> tuple[Array, Array]:
         if isinstance(effect, Effect):

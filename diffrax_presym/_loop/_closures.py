@@ -1,5 +1,6 @@
 """Arrays held by Python functions, as leaves of a pytree."""
 
+import functools
 import inspect
 from types import CellType, FunctionType
 from typing import Any
@@ -13,8 +14,8 @@ from jaxtyping import PyTree
 def closure_to_pytree(tree: PyTree) -> PyTree:
     """The same tree, with every array that one of its functions closes over as a leaf.
 
-    Custom derivative rules need this. Of what is not a function, such as a partial or
-    an object with attributes, write an `equinox.Module`.
+    Custom derivative rules need this. Of an object with attributes write an
+    `equinox.Module`.
     """
     return jtu.tree_map(_convert, tree)
 
@@ -25,6 +26,7 @@ class _Closure(eqx.Module):
     original: Any = eqx.field(static=True)
     cells: list[PyTree]
     defaults: tuple[PyTree, ...] | None
+    keywords: dict[str, PyTree] | None
 
     def __call__(self, *args, **kwargs):
         rebuild = lambda x: x.function if isinstance(x, _Closure) else x
@@ -37,7 +39,7 @@ class _Closure(eqx.Module):
             self.defaults,
             tuple(map(CellType, cells)),
         )
-        fn.__kwdefaults__ = self.original.__kwdefaults__
+        fn.__kwdefaults__ = self.keywords
         return fn(*args, **kwargs)
 
     @property
@@ -50,6 +52,9 @@ _JITTED = type(jax.jit(lambda: None))
 
 
 def _convert(x):
+    if isinstance(x, functools.partial):
+        fn, args, keywords = closure_to_pytree((x.func, x.args, x.keywords))
+        return eqx.Partial(fn, *args, **keywords)
     # A solve is compiled anyway, so `jax.jit` can be removed.
     fn = (
         inspect.unwrap(x, stop=lambda x: not isinstance(x, _JITTED))
@@ -64,9 +69,6 @@ def _convert(x):
         return x
     if any(cell is fn for cell in cells):  # a recursive function
         return x
-    cells = [closure_to_pytree(cell) for cell in cells]
-    defaults = None if fn.__defaults__ is None else closure_to_pytree(fn.__defaults__)
+    held = closure_to_pytree((cells, fn.__defaults__, fn.__kwdefaults__))
     # Functions compare by identity, so those without arrays are kept.
-    if not any(map(eqx.is_array, jtu.tree_leaves((cells, defaults)))):
-        return x
-    return _Closure(fn, cells, defaults)
+    return _Closure(fn, *held) if any(map(eqx.is_array, jtu.tree_leaves(held))) else x

@@ -112,18 +112,19 @@ class Collocation(AbstractMove):
     def prepare(self, system: System, span: Span) -> Frames | None:
         if system.friction is None:
             return None
-        (t0, _, h), table = span, gauss_table(self.number)
-        half, nodes = h / 2, cast_to(table.nodes, h)
-        middle, to_middle = t0 + half, (cast_to(0.5, h) - nodes) * h
-        decay = system.prepare_decay
-        return Frames(
-            decay(t0, half),
-            decay(middle, half),
-            decay(t0, h),
-            decay(t0 - half, h),
-            jax.vmap(decay)(t0 + nodes * h, to_middle),
-            jax.vmap(lambda x: decay(middle, -x))(to_middle),
-        )
+        (t0, _, h), nodes = span, cast_to(gauss_table(self.number).nodes, span.h)
+        half, to_middle = h / 2, (cast_to(0.5, h) - nodes) * h
+        middle = t0 + half
+        starts = jnp.stack([t0, middle, t0, t0 - half])
+        lengths = jnp.stack([half, half, h, h])
+        repeat = jnp.broadcast_to(middle, nodes.shape)
+        starts = jnp.concatenate([starts, t0 + nodes * h, repeat])
+        lengths = jnp.concatenate([lengths, to_middle, -to_middle])
+        effects = system.friction.prepare_decays(starts, lengths)
+        rows = lambda rows: jtu.tree_map(lambda x: x[rows], effects)
+        inwards, outwards = slice(4, 4 + len(nodes)), slice(4 + len(nodes), None)
+        parts = map(rows, [0, 1, 2, 3, inwards, outwards])
+        return Frames(*parts)
 
     def apply(
         self, system: System, span: Span, data: Frames | None, stage: Stage

@@ -1,5 +1,6 @@
 import math
 from collections.abc import Callable
+from itertools import takewhile
 from typing import Any, NamedTuple
 
 import jax
@@ -7,7 +8,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import ArrayLike
 
-from ._convergence import find_steps, Solution, Trial
+from ._convergence import doubling, find_steps, Solution, Trial
 from ._grid import intervals
 
 
@@ -129,8 +130,8 @@ def choose_step(
 
     `ValueError` if an argument is not valid or is traced. `RuntimeError` if the
     tolerance cannot be reached: in this precision, because solves with more steps stop
-    converging; within `max_steps`; or because no solve is finite. A solve that is not
-    finite is not an error otherwise, but one with a step that is too large.
+    converging; within `max_steps`; or because no solve is finite. A solve that fails
+    or is not finite is not an error otherwise, but one with a step that is too large.
     """
     if not callable(solve):
         raise ValueError(
@@ -153,8 +154,11 @@ def choose_step(
             "`choose_step(max_steps=...)` must be a positive integer, but got "
             f"{max_steps!r}."
         )
-    run = lambda n: Solution.of(n, solve((t1 - t0) / n))
-    grid = intervals(run(4).ts, t0, t1)
+    run = lambda n: Solution.of(n, solve, (t1 - t0) / n)
+    # Of a solve that fails, the saved times are not known.
+    tried = map(run, takewhile(lambda n: n <= max_steps, doubling(4)))
+    first = next((x for x in tried if x.finite), None)
+    grid = None if first is None else intervals(first.ts, t0, t1)
     best, convergence = find_steps(run, tolerances, grid, max_steps)
     return ChosenStep(
         dt0=(t1 - t0) / best.number,

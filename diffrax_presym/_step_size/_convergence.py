@@ -38,7 +38,11 @@ class Solution(NamedTuple):
     order: int | None  # of the scheme, if that is known
 
     @classmethod
-    def of(cls, number: int, sol: Any) -> "Solution":
+    def of(cls, number: int, solve: Callable[[float], Any], step) -> "Solution":
+        try:
+            sol = jax.block_until_ready(solve(step))
+        except RuntimeError:  # as `diffeqsolve` raises if a solve fails
+            return cls(number, number, np.zeros(0), [], False, None)
         if not isinstance(sol, dfx.Solution):
             raise ValueError(
                 "The solve must return a `diffrax.Solution`, the result of "
@@ -126,7 +130,7 @@ class Convergence:
         coarse = self.finest
         if coarse is not None and coarse.steps == solution.steps and coarse.finite:
             return False  # Steps between given times may be the same.
-        self.finest, self.claimed = solution, solution.order
+        self.finest, self.claimed = solution, solution.order or self.claimed
         if coarse is None:
             return False
         last, self._difference = self._difference, self._distance(coarse, solution)
@@ -228,17 +232,19 @@ class Convergence:
         )
         rounding = change < 1e3 * eps or (self._regular and change < eps**0.25)
         if self._stalls >= 2 and rounding:
-            double = (
-                "double precision (`jax.config.update('jax_enable_x64', True)`), "
-                if precision == np.float32
-                else ""
-            )
+            ways = [
+                "`adjoint=FixedStepAdjoint()`, whose steps have one length without "
+                "rounding",
+                "`Compensated(solver)`",
+                "double precision (`jax.config.update('jax_enable_x64', True)`)",
+            ]
+            # Only the loop of the package tells the order.
+            ways = ways[self.claimed is not None : 3 if precision == np.float32 else 2]
             raise RuntimeError(
-                f"`choose_step` cannot reach this tolerance in {precision}: rounding "
-                f"leaves an error of {self._least:.1e} times the tolerance with "
-                f"{self._at} steps, and more steps do not reduce it. Use "
-                f"`adjoint=FixedStepAdjoint()`, whose steps have one length without "
-                f"rounding, `Compensated(solver)`, {double}or a larger tolerance."
+                f"`choose_step` cannot reach this tolerance in {precision} for sure: "
+                f"from {self._at} steps on, solves with more steps differ by rounding, "
+                f"by {self._least:.1e} times the tolerance or more. Use "
+                f"{', '.join(ways)} or a larger tolerance."
             )
 
     def _distance(self, solution: Solution, finest: Solution | None) -> float:
@@ -265,11 +271,14 @@ def _numbers(grid: int) -> Iterator[int]:
     while numbers[-1] > 10:
         numbers.append((numbers[-1] - 1) // 2)
     yield from (n for n in reversed(numbers) if n > 3)
-    multiple = 3
+    yield from (n * grid for n in doubling(3) if n * grid > 3)
+
+
+def doubling(n: int) -> Iterator[int]:
+    """Integers, each about twice the last, without a common divisor."""
     while True:
-        if multiple * grid > 3:
-            yield multiple * grid
-        multiple = 2 * multiple + 1
+        yield n
+        n = 2 * n + 1
 
 
 def _smallest(

@@ -89,7 +89,7 @@ def plot_convergence(solve: Solve, t0, t1, order: int, axes: Any = None, solves=
     axes = _axes(axes)
     t0, t1 = check_times(t0, t1, "plot_convergence")
     numbers = [8 * 2**k for k in range(solves + 1)]
-    found = [Solution.of(n, solve((t1 - t0) / n)) for n in numbers]
+    found = [Solution.of(n, solve, (t1 - t0) / n) for n in numbers]
     finest = found[-1]
     points = [
         (abs(t1 - t0) / x.number, scaled_error(x.leaves, finest.leaves, 0.0, 1.0))

@@ -142,7 +142,7 @@ def work_precision(
             "`work_precision({name: solve}, t0, t1, rtol=1e-6, atol=1e-6)`."
         )
     span = t1 - t0
-    run = lambda solve, n: Solution.of(n, solve(span / n))
+    run = lambda solve, n: Solution.of(n, solve, span / n)
     goal = 10.0**-decades
     finest = {}
     for name, solve in solves.items():
@@ -169,7 +169,7 @@ def work_precision(
     for name, solve in (adaptive or {}).items():
         for k in range(2 * (2 * decades + 2) + 1):
             level = tolerance[0] / goal * 10 ** (-k / 2)
-            solution = Solution.of(0, solve(level))
+            solution = Solution.of(0, solve, level)
             error = _error(solution, exact, tolerance)
             if window(error):
                 measured.append((name, error, solution.steps, level, solve))
