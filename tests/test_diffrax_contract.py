@@ -1,10 +1,11 @@
 """Undocumented behaviour of Diffrax that this package relies on.
 
-If one of these tests fails after an update of Diffrax, adapt `diffrax_presym/_term.py`
-or `diffrax_presym/_solver/_base.py` accordingly.
+If one of these tests fails after an update of Diffrax, adapt
+`diffrax_presym/_system/_bound.py` or `diffrax_presym/_loop/_diffrax.py` accordingly.
 """
 
-from typing import ClassVar
+import inspect
+from typing import Any, ClassVar
 
 import diffrax as dfx
 import equinox as eqx
@@ -15,10 +16,18 @@ from helpers import oscillator
 from jax.core import Tracer
 
 import diffrax_presym as dps
+from diffrax_presym._loop import _diffrax as private
 
 
 TERM = oscillator()
 Y0 = (jnp.ones(1), jnp.ones(1))
+
+
+class Seen(dict):
+    """Compared by identity, as it may hold tracers."""
+
+    __eq__ = object.__eq__
+    __hash__: Any = object.__hash__
 
 
 class Recorder(dfx.AbstractSolver):
@@ -26,7 +35,7 @@ class Recorder(dfx.AbstractSolver):
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar = dfx.LocalLinearInterpolation
-    seen: dict = eqx.field(static=True, default_factory=dict)
+    seen: "Seen" = eqx.field(static=True, default_factory=lambda: Seen())
 
     def order(self, terms):
         return 1
@@ -178,3 +187,75 @@ def test_times_are_arrays_of_one_precision(call):
     assert {(t.shape, t.dtype) for t in times} == {((), jnp.dtype("float64"))}, (
         "Times are no longer passed to a solver in one floating-point precision."
     )
+
+
+class Watching(dfx.AbstractAdjoint):
+    """The adjoint of Diffrax, which keeps what it is given."""
+
+    seen: Seen = eqx.field(static=True, default_factory=Seen)
+
+    def loop(self, **kwargs):
+        self.seen.update(kwargs)
+        return dfx.DirectAdjoint().loop(**kwargs)
+
+
+def watched(**kwargs):
+    adjoint = Watching()
+    options: dict[str, Any] = dict(adjoint=adjoint, max_steps=16) | kwargs
+    run = lambda: dfx.diffeqsolve(TERM, Recorder(), 0.0, 1.0, y0=Y0, **options).stats
+    eqx.filter_eval_shape(run)
+    return adjoint.seen
+
+
+CONTROLLERS = {
+    "constant": dict(dt0=0.1),
+    "given": dict(dt0=None, stepsize_controller=dfx.StepTo(jnp.linspace(0, 1, 4))),
+}
+
+
+@pytest.mark.parametrize("steps", CONTROLLERS.values(), ids=CONTROLLERS)
+def test_what_an_adjoint_gets(steps):
+    subs = [dfx.SubSaveAt(ts=jnp.array([0.5])), {"end": dfx.SubSaveAt(t1=True)}]
+    seen = watched(saveat=dfx.SaveAt(subs=subs, dense=True), **steps)
+    arguments = set(inspect.signature(dps.FixedStepAdjoint.loop).parameters) - {"self"}
+    assert set(seen) == arguments, "`AbstractAdjoint.loop` gets other arguments."
+    state = seen["init_state"]
+    missing = {
+        *("y", "solver_state", "made_jump", "tprev", "num_steps", "result"),
+        *("num_accepted_steps", "progress_meter_state", "save_state", "dense_ts"),
+        *("controller_state", "dense_infos", "dense_save_index"),
+    } - set(vars(state))
+    assert not missing, f"The state of Diffrax's loop has no {missing}."
+    flat, structure = private.flatten_subs(seen["saveat"])
+    saves = structure.flatten_up_to(state.save_state)
+    assert len(saves) == len(flat) == 2, "`save_state` has another structure."
+    for save in saves:
+        names = {"ts", "ys", "save_index", "saveat_ts_index"}
+        assert set(vars(save)) >= names, "What is saved is stored otherwise."
+    assert private.dense_buffers(state)[0] is not None
+    first = jax.tree.leaves(state.controller_state)[0]
+    assert jnp.issubdtype(jnp.result_type(first), jnp.integer), (
+        "The first number of the state of a controller is no longer its step."
+    )
+
+
+def test_the_state_at_the_end_of_a_loop():
+    """That of the package differs from Diffrax's in rounding alone."""
+    saveat = dfx.SaveAt(
+        t0=True, ts=jnp.array([0.3, 0.6]), t1=True, controller_state=True
+    )
+    ours, theirs = (
+        dfx.diffeqsolve(
+            *(TERM, dps.BlanesMoanRKN4(), 0.0, 1.0, 0.25, Y0),
+            saveat=saveat,
+            adjoint=adjoint,
+        )
+        for adjoint in (dps.FixedStepAdjoint(), dfx.DirectAdjoint())
+    )
+    assert jax.tree.structure(ours.ys) == jax.tree.structure(theirs.ys)
+    assert ours.result == theirs.result
+    same = jax.tree.map(jnp.allclose, (ours.ts, ours.ys), (theirs.ts, theirs.ys))
+    assert jax.tree.all(same)
+    assert eqx.tree_equal(ours.controller_state, theirs.controller_state, rtol=1e-12)
+    assert set(theirs.stats) <= set(ours.stats)
+    assert all(ours.stats[k] == theirs.stats[k] for k in theirs.stats)
