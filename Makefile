@@ -7,7 +7,7 @@ VENV := .venv
 OLDEST := .venv-oldest
 BIN := $(VENV)/bin
 PIP := -m pip --quiet --disable-pip-version-check install
-# Number of test processes. `make test WORKERS=auto` uses all cores.
+# Number of processes of tests and examples. `make test WORKERS=auto` uses all cores.
 WORKERS ?= 2
 PYTEST = -m pytest -q -n $(WORKERS) --dist worksteal
 
@@ -74,12 +74,9 @@ tutorials: $(VENV)/.with-examples  ## Run tutorials and how-to pages, save their
 	@$(BIN)/python docs/_tutorials.py
 
 examples: $(VENV)/.with-examples  ## Run a short version of every example
-	@set -e; for script in $(EXAMPLES); do \
-		echo "--- $$script --quick"; $(BIN)/python $$script --quick; \
-	done; \
-	for name in $(PAPER); do \
-		echo "--- $$name --quick"; $(BIN)/python -m examples.paper.$$name --quick; \
-	done
+	@printf '%s\n' $(EXAMPLES) $(addprefix '-m examples.paper.',$(PAPER)) \
+		| xargs -P $(WORKERS) -I{} sh -c 'output=$$($(BIN)/python {} --quick 2>&1); \
+			status=$$?; printf "%s\n" "--- {} --quick" "$$output"; exit $$status'
 
 paper: $(VENV)/.with-examples  ## Reproduce the figures and tables of the paper
 	@set -e; for name in $(PAPER); do \

@@ -53,6 +53,10 @@ class Ravel(eqx.Module):
         with jax.numpy_dtype_promotion("standard"):
             return jnp.concatenate([jnp.ravel(leaf) for leaf in jtu.tree_leaves(x)])
 
+    @property
+    def zeros(self) -> Array:
+        return self(self.structure.unflatten([jnp.zeros(*x) for x in self.shapes]))
+
     def inverse(self, x: Array) -> PyTree:
         sizes = [int(np.prod(shape)) for shape, _ in self.shapes]
         parts = jnp.split(x, np.cumsum(sizes)[:-1])
@@ -192,7 +196,7 @@ class MatrixRate(eqx.Module):
     def plus(self, shift: float) -> "MatrixRate":
         return MatrixRate(self.matrix, self.shift + shift)
 
-    def dense(self, like: Array) -> Array:
+    def dense(self) -> Array:
         return self.matrix + self.shift * identity(self.matrix[..., 0])
 
 
@@ -223,8 +227,8 @@ class ProductRate(eqx.Module):
     def plus(self, shift: float) -> "ProductRate":
         return eqx.tree_at(lambda x: x.shift, self, self.shift + shift)
 
-    def dense(self, like: Array) -> Array:
-        return jax.jacfwd(self)(jnp.zeros_like(like))
+    def dense(self) -> Array:
+        return jax.jacfwd(self)(self.ravel.zeros)
 
 
 class CoupledFriction(eqx.Module):
@@ -240,11 +244,9 @@ class CoupledFriction(eqx.Module):
     def prepare(self, t: Time, h: Time, order: int) -> Exponents:
         return self.log_scale.exponents(t, h, order)
 
-    def prepare_decays(self, t: Array, h: Array) -> Effect | Exponents:
-        if isinstance(self.rate, ProductRate):
-            return jax.vmap(lambda t, h: self.prepare(t, h, 1))(t, h)
+    def prepare_decays(self, t: Array, h: Array) -> Effect:
         x = jax.vmap(self.log_scale.increment)(t, h)
-        return Effect(exponentials(cast_to(self.rate.dense(x), x), x)[0])
+        return Effect(exponentials(cast_to(self.rate.dense(), x), x)[0])
 
     def fix(self, effect: Any) -> Effect | Exponents:
         if isinstance(effect, Effect):
@@ -252,7 +254,7 @@ class CoupledFriction(eqx.Module):
         if not self.is_autonomous or isinstance(self.rate, ProductRate):
             return effect
         x = effect.x
-        matrix = cast_to(self.rate.dense(x), x)
+        matrix = cast_to(self.rate.dense(), x)
         change, carried = (
             y.reshape(*x.shape, *matrix.shape)
             for y in exponentials(matrix, jnp.ravel(x))
@@ -292,7 +294,7 @@ class CoupledFriction(eqx.Module):
         if singular is None:
             return force - rate * self.rate(p)
         net = force - jnp.where(singular, 0, rate) * self.rate(p)
-        matrix = self.log_scale.strength * cast_to(self.rate.dense(p), p)
+        matrix = self.log_scale.strength * cast_to(self.rate.dense(), p)
         limit = jnp.linalg.solve(identity(matrix[..., 0]) + matrix, force[..., None])[
             ..., 0
         ]
@@ -309,7 +311,7 @@ class CoupledFriction(eqx.Module):
         return jnp.exp(jnp.max(jnp.linalg.eigvalsh(symmetric)) * x)
 
     def contraction(self, t: Time, h: Time, p: Array) -> Scalar:
-        diagonal = jnp.diagonal(self.rate.dense(p), axis1=-2, axis2=-1)
+        diagonal = jnp.diagonal(self.rate.dense(), axis1=-2, axis2=-1)
         x = self.log_scale.increment(t, h)
         return x * cast_to(jnp.sum(jnp.broadcast_to(diagonal, jnp.shape(p))), x)
 

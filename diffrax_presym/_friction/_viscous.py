@@ -54,7 +54,8 @@ class ViscousDamping(AbstractFriction):
     for a solve, and a drift is two products with a matrix. Elsewhere a drift takes
     about ten products, more under strong friction. For sparse matrices above some
     hundreds of degrees of freedom pass a `lineax.FunctionLinearOperator`: no matrix is
-    stored.
+    stored (but by [`diffrax_presym.PresymplecticGauss`][], whose iteration applies it
+    often).
 
     If $C$ is a function of time and place, the friction is part of the kicks, and
     exact there at fixed positions: as [`diffrax_presym.PositionDamping`][].
