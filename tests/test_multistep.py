@@ -39,7 +39,6 @@ LAWS = {
     "excitation": dps.ConstantDamping(-0.1),
     "logarithmic": dps.LogDamping(1.5, 2.0),
     "mixed": [dps.LogDamping(0.4), dps.PowerDamping(0.2, 0.7)],
-    "function": lambda t: jnp.sin(t) / 5,
 }
 Y0 = (jnp.array([1.0, -0.5]), jnp.array([0.2, 0.4]))
 ONE = jnp.array(1.0)

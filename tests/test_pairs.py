@@ -341,7 +341,7 @@ def check_composition(scheme, wrapper):
 
 # Which are tried when.
 
-SAMPLE = 14
+SAMPLE = 8
 
 
 def rows():

@@ -136,7 +136,7 @@ def _by_products(
     rate = ProductRate(rates, coefficients, mechanics.mass, ravel)
     _check_values(laws[0], ravel(p), coupled=True)
     if not any(map(_is_implicit, (*rates, *coefficients, mechanics.mass))):
-        rate = MatrixRate(rate.dense(ravel(p)))
+        rate = MatrixRate(rate.dense())
     return CoupledFriction(laws[0], rate)
 
 
