@@ -278,6 +278,7 @@ def test_steps_between_kinks_keep_the_order(adjoint, t0, t1):
     assert sols[0].stats["num_steps"] == 44
 
 
+@pytest.mark.slow
 def test_steps_between_kinks_are_chosen_and_differentiated():
     options: dict[str, Any] = {"ts": jnp.array([2.0, 9.0])} | BETWEEN
     problem = TABLE, RKN4, 0.0, 10.0, Y0, 1e-7

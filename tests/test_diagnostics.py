@@ -29,6 +29,7 @@ def test_energies():
 
 
 @pytest.mark.variants(1)
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("term", [TERM, DRIVEN], ids=["damped", "driven"])
 def test_energy_error_is_that_of_the_solver(term):
     def error(solver):

@@ -304,6 +304,7 @@ def array_energy(t, q, args):
     return args * jnp.sum(1 - jnp.cos(q))
 
 
+@pytest.mark.variants(1)
 @each(CARRIES)
 def test_states_are_any_pytrees(scheme: Scheme):
     q, p = jnp.arange(1.0, 6.0) / 4, jnp.arange(5.0) / 5
@@ -373,6 +374,7 @@ def test_precision_is_that_of_the_input(scheme: Scheme, dtype):
 # Termination
 
 
+@pytest.mark.variants(1)
 @each(CARRIES)
 def test_an_empty_span_is_its_start(scheme: Scheme):
     saveat = dfx.SaveAt(
@@ -393,6 +395,7 @@ def test_an_empty_span_is_its_start(scheme: Scheme):
     assert_close(dense, Y0, 0)
 
 
+@pytest.mark.variants(1)
 @of("leapfrog_AB", "tao_4")
 def test_too_few_steps(scheme: Scheme):
     def short(throw):

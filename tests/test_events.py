@@ -285,6 +285,7 @@ def test_nothing_is_saved_after_the_event():
     assert np.all(q[:-1] > 0) and abs(q[-1]) < 1e-12
 
 
+@pytest.mark.slow
 def test_a_batch_of_which_some_have_an_event():
     q0 = jnp.array([0.5, 1.5, 3.1])
     event = dfx.Event(through_the_bottom, FINDER)

@@ -200,6 +200,7 @@ def test_each_leaf_is_as_accurate_as_its_precision_allows():
         assert np.max(np.abs(x.astype(jnp.float64) - y)) < 20 * jnp.finfo(x.dtype).eps
 
 
+@pytest.mark.variants(1)
 @each([scheme for scheme in SCHEMES if scheme.name in ("leapfrog_AB", "tao_4")])
 def test_float32_agrees_with_float64(scheme: Scheme):
     def run(dtype):

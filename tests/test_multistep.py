@@ -104,6 +104,7 @@ def test_order(order, law):
     assert errors[0] < 1e-7 and errors[1] < 3e-9
 
 
+@pytest.mark.slow
 def test_backwards_in_time_and_any_mass():
     mass = jnp.array([[2.0, 0.5], [0.5, 1.0]])
     damping = dps.LogDamping(1.0, 3.0)
@@ -227,6 +228,7 @@ def test_a_jump_starts_again():
     assert largest(walk(Y0, False), exact) > 1e-3
 
 
+@pytest.mark.slow
 def test_events():
     hamiltonian, solver = system(LAWS["constant"]), dps.SymmetricMultistep(8)
     cond = lambda t, y, args, **kwargs: y[0][0]
@@ -241,6 +243,7 @@ def test_events():
 # Everything else
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ("none", pytest.param("mixed", marks=pytest.mark.slow)))
 def test_between_steps_the_error_is_that_at_steps(law):
     hamiltonian, solver = system(LAWS[law]), dps.SymmetricMultistep(12)
@@ -261,6 +264,7 @@ def test_between_steps_the_error_is_that_at_steps(law):
     assert_close(at_ends, jax.tree.map(lambda x: x[:40], dense.ys), 1e-12)
 
 
+@pytest.mark.slow
 def test_vmap():
     solver = dps.SymmetricMultistep(8)
 

@@ -33,6 +33,7 @@ def energy_errors(solver, dt0):
     return np.max(errors[:quarter]), np.max(errors[-quarter:])
 
 
+@pytest.mark.slow
 def test_energy_errors_do_not_grow():
     for solver, dt0 in [
         (dps.PresymplecticTao(), 1 / 40),

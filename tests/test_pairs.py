@@ -341,7 +341,7 @@ def check_composition(scheme, wrapper):
 
 # Which are tried when.
 
-SAMPLE = 8
+SAMPLE = 6
 
 
 def rows():
