@@ -473,7 +473,6 @@ def test_shapes_that_do_not_fit(friction, message):
         step(wrong, dps.BlanesMoan4(), 0.0, 0.1, Y0)
 
 
-@pytest.mark.xfail(strict=True, raises=TypeError, reason="shapes of `medium` unchecked")
 @pytest.mark.parametrize("medium", [jnp.ones(2), lambda t, q, args: jnp.ones(2)])
 def test_a_wind_that_does_not_fit(medium):
     wrong = dps.MechanicalSystem(KINETIC, harmonic, dps.Drag(0.1, medium=medium))

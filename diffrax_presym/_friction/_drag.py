@@ -153,15 +153,21 @@ class Drag(AbstractFriction):
 def _of_medium(medium, p: PyTree) -> PyTree:
     if medium is None:
         return jtu.tree_map(lambda x: jnp.zeros((), x.dtype), p)
-    if not jtu.treedef_is_leaf(jtu.tree_structure(medium)):
-        return jtu.tree_map(lambda x, w: cast_to(w, x), p, medium)
+    if jtu.treedef_is_leaf(jtu.tree_structure(medium)):
+        medium = jtu.tree_map(lambda _: medium, p)
 
-    def leaf(x: Array) -> Array:
-        w = cast_to(medium, x)
-        # One velocity for all bodies.
-        return w.reshape((1,) * (x.ndim - w.ndim) + w.shape) if w.ndim else w
+    def leaf(x: Array, w: Array) -> Array:
+        # With fewer dimensions, one velocity for all bodies.
+        shape = (1,) * (x.ndim - w.ndim) + w.shape
+        fits = zip(shape, x.shape, strict=False)
+        if len(shape) > x.ndim or any(a not in (1, b) for a, b in fits):
+            raise ValueError(
+                f"`Drag(..., medium=...)` of shape {w.shape} does not fit `p` of shape "
+                f"{x.shape}. Pass the velocity of the medium, which broadcasts to `p`."
+            )
+        return cast_to(w, x).reshape(shape)
 
-    return jtu.tree_map(leaf, p)
+    return jtu.tree_map(leaf, p, medium)
 
 
 def _per_body(form, p: PyTree, name: str) -> PyTree:
