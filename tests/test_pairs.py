@@ -9,6 +9,7 @@ central differences.
 
 import dataclasses
 import itertools
+import pathlib
 import random
 import re
 from functools import cache, cached_property, partial
@@ -20,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+import orders
 import pytest
 from catalogue import claim, offered, Problem, reference, Refused
 from conftest import seed
@@ -392,3 +394,8 @@ def test_all_that_is_exported_is_in_the_catalogue():
     public = {name for name in vars(dps) if name[0].isupper()}
     missing = {name for name in public - found if not name.startswith("Abstract")}
     assert missing == catalogue.ELSEWHERE
+
+
+def test_the_table_of_orders():
+    page = pathlib.Path(__file__).parents[1] / "docs" / "friction.md"
+    assert orders.table() in page.read_text(), "Print it by `python tests/orders.py`."
