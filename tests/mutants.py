@@ -1,0 +1,255 @@
+"""Deliberate errors, and whether the catalogue finds them.
+
+`python tests/mutants.py [NAME ...]` applies each to a copy of the package, runs a
+sample of the pairs alone, and prints found or missed. An error is found if a test
+fails.
+"""
+
+import argparse
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+import tempfile
+from typing import NamedTuple
+
+
+ROOT = pathlib.Path(__file__).parents[1]
+
+
+class Mutant(NamedTuple):
+    name: str
+    file: str  # in the package
+    old: str
+    new: str
+
+
+MUTANTS = [
+    # Friction.
+    Mutant(
+        "Gauss: the frames of the stages to the middle for both directions",
+        "_scheme/_gauss.py",
+        "[lengths, to_middle, -to_middle]",
+        "[lengths, to_middle, to_middle]",
+    ),
+    Mutant(
+        "Gauss: one exponential for the frames of all stages",
+        "_scheme/_gauss.py",
+        "to_middle = h / 2, (cast_to(0.5, h) - nodes) * h",
+        "to_middle = h / 2, (cast_to(0.5, h) - nodes[:1] + 0 * nodes) * h",
+    ),
+    Mutant(
+        "a rate that jumps is accepted in the shared frame",
+        "_friction/_log_scale.py",
+        "# It may have a rate that jumps.\n    is_smooth: ClassVar[bool] = False",
+        "is_smooth: ClassVar[bool] = True",
+    ),
+    Mutant(
+        "no closed form of the logarithm",
+        "_friction/_log_scale.py",
+        "return Exponents(x, Integral(start, x, -1.0), Integral(start + h, x, 1.0))",
+        "return by_quadrature(self, t, h, order)",
+    ),
+    Mutant(
+        "the start of a singular law is not a case of its own",
+        "_friction/_log_scale.py",
+        "jnp.where(singular, _ALL_LOST, jnp.log1p(as_time(h) / since))",
+        "jnp.log1p(as_time(h) / self._after(t))",
+    ),
+    Mutant(
+        "a wrong sign in an integral",
+        "_friction/_log_scale.py",
+        "Integral(start + h, x, 1.0)",
+        "Integral(start + h, x, -1.0)",
+    ),
+    Mutant(
+        "an order of quadrature too low",
+        "_friction/_exponential.py",
+        "leggauss((order + 1) // 2)",
+        "leggauss(max(1, (order - 1) // 2))",
+    ),
+    Mutant(
+        "the integral of a decaying matrix for the whole time, twice",
+        "_friction/_rates.py",
+        "return matvec(change, p), matvec(carried, p)",
+        "return matvec(change, p), matvec(change, p)",
+    ),
+    Mutant(
+        "too few terms of a series",
+        "_friction/_exponential.py",
+        "_TERMS = 14",
+        "_TERMS = 5",
+    ),
+    Mutant(
+        "rounding is not seen in a series",
+        "_friction/_exponential.py",
+        "eps / 8 * size(y)) & (most <= _GROWTH * size(y))\n            return open",
+        "1e-5 * size(y)) & (most <= _GROWTH * size(y))\n            return open",
+    ),
+    Mutant(
+        "a matrix times a law in time is prepared once",
+        "_friction/_rates.py",
+        "return self.log_scale.is_autonomous",
+        "return True",
+    ),
+    Mutant(
+        "drag without the power of the speed",
+        "_friction/_drag.py",
+        "distance = ratio * expm1_ratio((k - 2) * lost)",
+        "distance = ratio * expm1_ratio((k - 1) * lost)",
+    ),
+    Mutant(
+        "a wind with the wrong sign",
+        "_friction/_drag.py",
+        "p / mass - w",
+        "p / mass + w",
+    ),
+    # Moves.
+    Mutant(
+        "what a drift prepares is that of another time",
+        "_scheme/_moves.py",
+        "return split.prepare(system, span.t0, span.h, self.order)",
+        "return split.prepare(system, span.t1, span.h, self.order)",
+    ),
+    Mutant(
+        "a kick at the wrong time",
+        "_scheme/_moves.py",
+        "        force = split.force(system, span.t0, y)\n",
+        "        force = split.force(system, span.t0 + span.h / 100, y)\n",
+    ),
+    Mutant(
+        "a frozen drift takes the velocity at the wrong time",
+        "_scheme/_moves.py",
+        "velocity = system.velocity(span.t0, y)",
+        "velocity = system.velocity(span.t1, y)",
+    ),
+    Mutant(
+        "a copy does not decay",
+        "_scheme/_copies.py",
+        "(system.decay(data, copy), field)",
+        "(copy, field)",
+    ),
+    Mutant(
+        "the adjoint sequence in the wrong order",
+        "_scheme/_engine.py",
+        "moves = [inverse(move) for move in self.moves[::-1]]",
+        "moves = [inverse(move) for move in self.moves]",
+    ),
+    Mutant(
+        "times of the inverse are not turned",
+        "_scheme/_engine.py",
+        "np.stack([1 - end, 1 - start, length], axis=-1)",
+        "np.stack([start, end, length], axis=-1)",
+    ),
+    Mutant(
+        "lost digits have the wrong sign",
+        "_scheme/_moves.py",
+        "return (system.values(y), (carry, rounding_errors(y))), None",
+        "return (system.values(y), (rounding_errors(y), carry)), None",
+    ),
+    # The loop and its gradient.
+    Mutant(
+        "a saved row is shifted by one",
+        "_loop/_run.py",
+        "stop = jnp.where(reached, rows.stop, 0)",
+        "stop = jnp.where(reached, rows.stop - 1, 0)",
+    ),
+    Mutant(
+        "a saved time is that of the end of its step",
+        "_loop/_run.py",
+        "times = system.time(begin), system.time(t)",
+        "times = system.time(begin), system.time(end)",
+    ),
+    Mutant(
+        "equal steps of the length asked for",
+        "_loop/_steps.py",
+        "self.length = jnp.where(finite, spans / several, dt0)",
+        "self.length = jnp.where(finite, spans / several * 1.001, dt0)",
+    ),
+    Mutant(
+        "a last step is left out",
+        "_loop/_steps.py",
+        "self.first, self.total = ends - counts, ends[-1]",
+        "self.first, self.total = ends - counts, ends[-1] - 1",
+    ),
+    Mutant(
+        "the cotangent of the dense output of a start is dropped",
+        "_loop/_backward.py",
+        "bar = tree_sum(bar, start_bar)",
+        "bar = bar",
+    ),
+    Mutant(
+        "the cotangent of what a step prepared is dropped",
+        "_loop/_backward.py",
+        "gradient = tree_sum(gradient, self._pull_prepared(fn, prepared))",
+        "gradient = gradient",
+    ),
+    Mutant(
+        "the cotangent of what all steps share is dropped",
+        "_loop/_backward.py",
+        "shared = tree_sum(shared, prepared)",
+        "shared = shared",
+    ),
+    Mutant(
+        "the cotangent of the last of the rows is dropped",
+        "_loop/_backward.py",
+        "[jnp.sum(rows.reached(n)) for rows in problem.rows]",
+        "[jnp.sum(rows.reached(n)) - 1 for rows in problem.rows]",
+    ),
+    Mutant(
+        "outputs of the end are not pulled back",
+        "_loop/_backward.py",
+        "at = at.add(*self._pull_point(i, n, point, row))",
+        "at = at.add(tree_zeros(at.gradient), tree_zeros(at.bar))",
+    ),
+    # What is refused.
+    Mutant(
+        "Nystrom splittings take friction by place",
+        "_system/_split.py",
+        '"separable": separable, "nystrom": nystrom}',
+        '"separable": separable, "nystrom": True}',
+    ),
+]
+
+
+def found(mutant: Mutant, rows: int) -> bool:
+    with tempfile.TemporaryDirectory() as folder:
+        copy = pathlib.Path(folder)
+        for part in ("diffrax_presym", "tests"):
+            shutil.copytree(ROOT / part, copy / part)
+        shutil.copytree(ROOT / "docs", copy / "docs")
+        shutil.copy(ROOT / "pyproject.toml", copy)
+        path = copy / "diffrax_presym" / mutant.file
+        text = path.read_text()
+        assert mutant.old in text, f"{mutant.name}: not found in {mutant.file}"
+        path.write_text(text.replace(mutant.old, mutant.new))
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "2"]
+        command += ["-m", "not slow", "-p", "no:cacheprovider", "tests/test_pairs.py"]
+        environment = os.environ | {"PYTHONPATH": folder, "ROWS": str(rows)}
+        run = subprocess.run(
+            command, cwd=copy, env=environment, capture_output=True, text=True
+        )
+        return run.returncode == 1
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", help="words in the names of some of them")
+    parser.add_argument("--rows", type=int, default=24, help="the size of the sample")
+    options = parser.parse_args()
+    number = 0
+    chosen = [
+        mutant
+        for mutant in MUTANTS
+        if not options.names or any(word in mutant.name for word in options.names)
+    ]
+    for mutant in chosen:
+        right = found(mutant, options.rows)
+        number += right
+        print(f"{'found ' if right else 'MISSED'} {mutant.name}", flush=True)
+    print(f"{number} of {len(chosen)} found")
+
+
+if __name__ == "__main__":
+    main()
