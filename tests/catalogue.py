@@ -1080,7 +1080,7 @@ def _unequal(problem, n, y0):
 
 def _adaptive(problem, n, y0):
     solver = dfx.HalfSolver(problem.solver)
-    tolerance = 1 / n**4
+    tolerance = 1 / n**3
     controller = dfx.PIDController(rtol=tolerance, atol=tolerance)
     problem = dataclasses.replace(problem, solver=solver)
     sol = problem.solve(

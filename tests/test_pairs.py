@@ -174,7 +174,9 @@ def check_order(run: Run, claimed: float, rounding: float):
         errors[max(n, least)] = error
     assert errors, "no solve was successful"
     assert min(errors.values()) < 0.1
-    last = sorted(errors)[-3:]
+    # The errors of Tao's copies oscillate.
+    number = 6 if run.row["scheme"].name.startswith("Tao") else 3
+    last = sorted(errors)[-number:]
     if len(last) < 3 or errors[last[0]] < 30 * rounding:
         # Too accurate for its order to be seen.
         return

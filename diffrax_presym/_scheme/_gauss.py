@@ -46,7 +46,6 @@ class Frames(NamedTuple):
     to_middle: Effects  # from the start
     from_middle: Effects  # to the end
     whole: Effects
-    last: Effects  # from the middle of the last step, if that was as long
     inwards: Effects  # from each stage to the middle
     outwards: Effects  # from the middle to each stage
 
@@ -115,15 +114,14 @@ class Collocation(AbstractMove):
         (t0, _, h), nodes = span, cast_to(gauss_table(self.number).nodes, span.h)
         half, to_middle = h / 2, (cast_to(0.5, h) - nodes) * h
         middle = t0 + half
-        starts = jnp.stack([t0, middle, t0, t0 - half])
-        lengths = jnp.stack([half, half, h, h])
+        starts, lengths = jnp.stack([t0, middle, t0]), jnp.stack([half, half, h])
         repeat = jnp.broadcast_to(middle, nodes.shape)
         starts = jnp.concatenate([starts, t0 + nodes * h, repeat])
         lengths = jnp.concatenate([lengths, to_middle, -to_middle])
         effects = system.friction.prepare_decays(starts, lengths)
         rows = lambda rows: jtu.tree_map(lambda x: x[rows], effects)
-        inwards, outwards = slice(4, 4 + len(nodes)), slice(4 + len(nodes), None)
-        parts = map(rows, [0, 1, 2, 3, inwards, outwards])
+        inwards, outwards = slice(3, 3 + len(nodes)), slice(3 + len(nodes), None)
+        parts = map(rows, [0, 1, 2, inwards, outwards])
         return Frames(*parts)
 
     def apply(
@@ -164,7 +162,8 @@ class Collocation(AbstractMove):
         matrix = weights[:, None] * _dot(ahead[: len(nodes)].T, project)
         if data is not None:
             # Backwards in time the slopes are those of this step.
-            moved = jax.vmap(lambda p: system.move_frame(data.last, p))(p)
+            # About the decay from the middle of the last step.
+            moved = jax.vmap(lambda p: system.move_frame(data.whole, p))(p)
             p = tree_where(ratio > 0, moved, p)
         guess = jtu.tree_map(lambda x: _dot(matrix, x), (q, p))
         return tree_where(known, guess, tree_zeros(guess))
