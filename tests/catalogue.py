@@ -924,6 +924,8 @@ def claim(
         order = wrapper.order(order)
     if friction.kind == "drag" and system.size == 1:
         return min(order, 2)  # |v| v has a kink where the body turns
+    if friction.kink is not None and wrapper.composes and scheme.needs is None:
+        return min(order, 2)  # steps of a composition go beyond their ends
     if friction.limit is None:
         return order
     # From a singularity on: an exact drift of a known mass leaves more than others.

@@ -11,7 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from .._misc import cast_to, Scalar
+from .._misc import cast_to
+
+
+Numbers = Inexact[Array, "..."]
 
 
 def gauss_legendre(h: ArrayLike, order: int) -> tuple[Array, Array]:
@@ -25,7 +28,7 @@ def gauss_legendre(h: ArrayLike, order: int) -> tuple[Array, Array]:
 
 
 @jax.custom_jvp
-def expm1(x: Scalar) -> Scalar:
+def expm1(x: Numbers) -> Numbers:
     return jnp.where(jnp.abs(x) < 0.1, x * _series(x), jnp.exp(x) - 1)
 
 
@@ -37,7 +40,7 @@ def _expm1_jvp(x, dx):
 
 
 @jax.custom_jvp
-def expm1_ratio(x: Scalar) -> Scalar:
+def expm1_ratio(x: Numbers) -> Numbers:
     small = jnp.abs(x) < 0.1
     return jnp.where(small, _series(x), (jnp.exp(x) - 1) / jnp.where(small, 1, x))
 
@@ -52,7 +55,7 @@ def _expm1_ratio_jvp(x, dx):
 
 
 @jax.custom_jvp
-def log1p_ratio(x: Scalar) -> Scalar:
+def log1p_ratio(x: Numbers) -> Numbers:
     """`log(1 + x) / x`, and NaN for `x <= -1`."""
     zero = x == 0
     value = jnp.log1p(x) / jnp.where(zero, 1, x)
@@ -70,7 +73,7 @@ def _log1p_ratio_jvp(x, dx):
     ) * dx
 
 
-def _series(x: Scalar, derivative: int = 0) -> Scalar:
+def _series(x: Numbers, derivative: int = 0) -> Numbers:
     """The series of the ratio, or of its derivative."""
     terms = [1 / math.factorial(k + 1) for k in range(10 + derivative)]
     for _ in range(derivative):
@@ -78,7 +81,7 @@ def _series(x: Scalar, derivative: int = 0) -> Scalar:
     return _horner(terms, x)
 
 
-def _horner(terms: list[float], x: Scalar) -> Scalar:
+def _horner(terms: list[float], x: Numbers) -> Numbers:
     # `jnp.polyval` would be a loop.
     value = terms[-1]
     for c in terms[-2::-1]:

@@ -1,6 +1,6 @@
 """The solution of the equations of the stages of Gauss collocation."""
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import diffrax as dfx
 import jax
@@ -22,6 +22,7 @@ Slopes = PyTree[Shaped[Array, "stages ..."]]
 Stages = PyTree[Shaped[Array, "stages ..."]]
 
 
+@runtime_checkable
 class Equations(Protocol):
     """The equations of the stages of a step."""
 
