@@ -33,6 +33,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import diffrax_presym as dps
+from diffrax_presym.extend import AbstractPresymplecticSolver
 
 
 matplotlib.use("Agg")
@@ -59,6 +60,8 @@ def pendulum():
 
 def solver_of(system, solver, dt0=0.25, throw=False, **kwargs):
     """The solve of a batch of initial states, from `y0` to the state at `T1`."""
+    if dt0 is not None and isinstance(solver, AbstractPresymplecticSolver):
+        kwargs.setdefault("adjoint", dps.FixedStepAdjoint())
 
     def solve(y0):
         # `throw=True` would check for failures across all devices.

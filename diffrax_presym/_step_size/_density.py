@@ -91,8 +91,8 @@ class StepDensityController(dfx.AbstractStepSizeController):
 
     For very uneven motion, such as close encounters; with every symmetric scheme of
     this package and any solver of Diffrax. Not for smooth motion, where constant steps
-    are cheaper. Requires `dt0=None`; a solve fails with
-    `RESULTS.dt_min_reached` if a step vanishes or is not finite.
+    are cheaper. Requires `dt0=None`; a solve fails with `RESULTS.dt_min_reached` if a
+    step vanishes, as it does where the density is infinite.
 
     ??? cite "Reference"
 

@@ -70,9 +70,7 @@ class ForceField(AbstractPotential):
     As the potential of a [`diffrax_presym.MechanicalSystem`][]: for measured force
     fields, stochastic gradients, forces that are not conservative, or potentials too
     expensive to compute. Every scheme accepts it, but is (pre)symplectic only if the
-    force derives from an energy. Schemes of order above 4 differentiate it for dense
-    output in the loop of Diffrax, so a function that JAX cannot differentiate, such as
-    `jax.pure_callback`, needs a `jax.custom_jvp`.
+    force derives from an energy.
     """
 
     fn: Callable
