@@ -393,7 +393,7 @@ class Friction:
     smooth: bool = True  # whether its rate has a derivative that is known
     # From rest at a singularity: the order that is left, and the limit of the force and
     # its friction, of the system and the force.
-    left: float = np.inf
+    left: Callable[[System], float] = lambda s: np.inf
     limit: Callable | None = None
     kink: float | None = None
 
@@ -408,6 +408,10 @@ def _rates(system):
 def _shaped(system, numbers):
     """Numbers for the entries of a state as the package takes them."""
     return jax.tree.map(jnp.asarray, ravel_pytree(system.q)[1](jnp.asarray(numbers)))
+
+
+def _over_mass(system):
+    return np.diag(4 + _rates(system)) @ np.linalg.inv(system.mass)
 
 
 def _matrix(system, skew=False):
@@ -535,7 +539,7 @@ def _from_rest(name, law, gamma, extra=0.0):
         *(name, lambda system: law, _rate(lambda t: gamma / t + extra / np.sqrt(t))),
         *("one rate", eta),
         constant=False,
-        left=2 if extra else gamma + 1,
+        left=lambda s: 2 if extra else gamma + 1,
         limit=lambda system, force: force / (1 + gamma),
     )
 
@@ -617,9 +621,10 @@ FRICTION = [
         *(lambda s, t, q, p, v: -(4 + _rates(s)) / t * v, "entries"),
         needs="mass",
         constant=False,
-        left=4,
+        # One more than the smallest rate times `t`.
+        left=lambda s: int(1 + np.min(np.linalg.eigvals(_over_mass(s)).real)),
         limit=lambda s, force: np.linalg.solve(
-            np.eye(s.size) + np.diag(4 + _rates(s)) @ np.linalg.inv(s.mass), force
+            np.eye(s.size) + _over_mass(s), force
         ),
     ),
     Friction(
@@ -628,7 +633,7 @@ FRICTION = [
         *(lambda s, t, q, p, v: -4 / t * _matrix(s) @ v, "matrix"),
         needs="mass",
         constant=False,
-        left=2,
+        left=lambda s: 2,
         limit=lambda s, force: np.linalg.solve(
             np.eye(s.size) + 4 * _matrix(s) @ np.linalg.inv(s.mass), force
         ),
@@ -930,7 +935,7 @@ def claim(
         return order
     # From a singularity on: an exact drift of a known mass leaves more than others.
     exact = scheme.needs in ("any", "nystrom") and system.mass is not None
-    return min(order, friction.left if exact else 2)
+    return min(order, friction.left(system) if exact else 2)
 
 
 def fails(system: System, friction: Friction, scheme: Scheme, wrapper: Wrapper) -> bool:

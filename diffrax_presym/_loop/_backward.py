@@ -130,7 +130,12 @@ class Backward(eqx.Module):
             ]
 
         def steps(at: Position, stop: Array) -> Position:
-            back = lambda at: self.step(at, start(at.n - 1))
+            def back(at: Position) -> Position:
+                # Members of a batch that are done repeat a step that may be undone.
+                n = jnp.maximum(at.n, stop + 1)
+                at = eqx.tree_at(lambda at: at.n, at, n)
+                return self.step(at, start(n - 1))
+
             return lax.while_loop(lambda at: at.n > stop, back, at)
 
         if not any(map(len, self.problem.rows)):

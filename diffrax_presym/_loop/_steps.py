@@ -130,6 +130,8 @@ class Steps(eqx.Module):
 
     def span(self, system: System, n: Int[Array, ""]) -> Span:
         """Step `n`, in physical time."""
+        # In a batch, members that are done repeat a step, which must not fail.
+        n = jnp.maximum(jnp.minimum(n, self.total - 1), 0)
         t0, t1 = system.time(self.time(n)), system.time(self.time(n + 1))
         if self.ts is not None:
             return Span(t0, t1, t1 - t0)

@@ -98,9 +98,7 @@ class Composition(AbstractComposition):
         self.composed_order = order
 
     def order(self, terms) -> int:
-        if self.composed_order is None:
-            return self.base.order(terms)
-        return self.composed_order
+        return max(self.composed_order or 1, self.base.order(terms))
 
 
 class SuzukiYoshida(AbstractComposition):
@@ -174,7 +172,7 @@ class SuzukiYoshida(AbstractComposition):
         self.composed_order = order
 
     def order(self, terms) -> int:
-        return self.composed_order
+        return max(self.composed_order, self.base.order(terms))
 
 
 class PresymplecticYoshida4(AbstractComposition):
@@ -232,7 +230,7 @@ class AbstractTabulated(AbstractComposition):
         return self.tableau.weights
 
     def order(self, terms) -> int:
-        return self.tableau.order
+        return max(self.tableau.order, self.base.order(terms))
 
 
 _BASE = """**Arguments:**

@@ -215,8 +215,10 @@ class PresymplecticTao(AbstractPresymplecticSolver):
             time. A few times the highest frequency of the system is a good value.
             Avoid $2 \xi h$ near a multiple of $\pi$, where the coupling resonates with
             the step. Defaults to `None`, which is $\xi = 3\pi / 16h$, half-way between
-            resonance and copies that drift apart; not for use inside a
-            [`diffrax_presym.Composition`][].
+            resonance and copies that drift apart. That is one angle per step of any
+            length, so not for use inside a [`diffrax_presym.Composition`][], nor with
+            `diffrax.HalfSolver`, whose error estimate then does not vanish with the
+            step.
 
         **Raises:**
 
