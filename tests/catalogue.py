@@ -623,9 +623,7 @@ FRICTION = [
         constant=False,
         # One more than the smallest rate times `t`.
         left=lambda s: int(1 + np.min(np.linalg.eigvals(_over_mass(s)).real)),
-        limit=lambda s, force: np.linalg.solve(
-            np.eye(s.size) + _over_mass(s), force
-        ),
+        limit=lambda s, force: np.linalg.solve(np.eye(s.size) + _over_mass(s), force),
     ),
     Friction(
         "matrix / t",
@@ -929,8 +927,8 @@ def claim(
         order = wrapper.order(order)
     if friction.kind == "drag" and system.size == 1:
         return min(order, 2)  # |v| v has a kink where the body turns
-    if friction.kink is not None and wrapper.composes and scheme.needs is None:
-        return min(order, 2)  # steps of a composition go beyond their ends
+    if friction.kink is not None and not (scheme.inside and wrapper.inside):
+        return min(order, 2)  # stages go beyond the ends of a step
     if friction.limit is None:
         return order
     # From a singularity on: an exact drift of a known mass leaves more than others.

@@ -189,7 +189,9 @@ def check_symmetry(hamiltonian, there, back, tolerance):
     y = (Q0, P0)
     (y2, carry), start = there_and_back(hamiltonian, there, back, T0, T1, y)
     assert_close(y2, y, tolerance)
-    assert_close(carry, start, tolerance)
+    if not isinstance(there, dps.PresymplecticGauss):
+        # Which carries the slopes of the last step, to begin an iteration.
+        assert_close(carry, start, tolerance)
 
 
 @pytest.mark.parametrize(

@@ -36,15 +36,10 @@ def check_structure_and_symmetry(system, solver, t0, t1):
     assert_close(step(system, solver, t1, t0, end)[0], Y0, 1e-14)
 
 
-def wavy(t):
-    return 0.1 * t + 0.2 * jnp.sin(t)
-
-
 LAWS = {
     "constant": dps.ConstantDamping(0.3),
     "log": dps.LogDamping(3.0),
     "mixed": [dps.LogDamping(0.3), dps.PowerDamping(0.1, 0.5)],
-    "function": wavy,
     "none": None,
 }
 each_law = pytest.mark.parametrize(
