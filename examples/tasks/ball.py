@@ -1,5 +1,7 @@
 """A ball in the wind, with quadratic drag, which bounces five times."""
 
+from typing import Any
+
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
@@ -30,7 +32,7 @@ landing = dfx.Event(
 def bounces(dt0):
     def flight(start, _):
         t, (q, v) = start
-        sol = dfx.diffeqsolve(
+        sol: Any = dfx.diffeqsolve(
             *(system, dps.BlanesMoan4(), t, t + 10.0, dt0),
             system.from_velocity(t, (q, v)),
             event=landing,
@@ -60,7 +62,7 @@ def hit(t, y):
     return y[1]
 
 
-hit.terminal, hit.direction = True, -1
+hit.terminal, hit.direction = True, -1  # pyright: ignore
 t, y, exact = 0.0, np.array([0.0, 2.0, 3.0, 0.0]), []
 for _ in range(5):
     flight = solve_ivp(

@@ -28,7 +28,7 @@ def model(parameters):
     )
     return dfx.diffeqsolve(
         *(system, dps.TunedRKN6(), 0.0, 20.0, 0.25, (jnp.ones(1), jnp.zeros(1))),
-        saveat=dfx.SaveAt(ts=ts, fn=lambda t, y, args: y[0][0]),
+        saveat=dfx.SaveAt(ts=jnp.asarray(ts), fn=lambda t, y, args: y[0][0]),
         adjoint=dps.FixedStepAdjoint(),
     ).ys
 

@@ -33,7 +33,7 @@ y0 = system.from_velocity(0.0, (jnp.array(angles), jnp.array(velocities)))
 def solve(dt0):
     return dfx.diffeqsolve(
         *(system, dps.TunedRKN6(), 0.0, 30.0, dt0, y0),
-        saveat=dfx.SaveAt(ts=ts, fn=system.to_velocity),
+        saveat=dfx.SaveAt(ts=jnp.asarray(ts), fn=system.to_velocity),
         adjoint=dps.FixedStepAdjoint(),
         max_steps=None,
     )

@@ -24,7 +24,7 @@ system = dps.MechanicalSystem(
     friction=dps.ViscousDamping(coefficients),
 )
 y0 = jnp.array([1.0, 0.0, 0.2]), jnp.array([0.0, 0.8, 0.1])
-ts = np.linspace(0.0, 40.0, 101)
+ts = jnp.linspace(0.0, 40.0, 101)
 
 
 @jax.jit
@@ -43,7 +43,7 @@ sol = solve(step.dt0)
 
 def field(t, y):
     q, v = np.split(y, 2)
-    force = np.cross(v, [0.0, 0.0, 1 + q @ q / 4])
+    force = np.cross(v, np.array([0.0, 0.0, 1 + q @ q / 4]))
     return np.concatenate([v, force - q / 2])
 
 

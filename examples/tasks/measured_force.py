@@ -1,5 +1,7 @@
 """A force from a measured table, linear between its times."""
 
+from itertools import pairwise
+
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
@@ -44,7 +46,7 @@ def field(t, y):
 
 
 y = [1.0, 0.0]
-for a, b in zip(times[:-1], times[1:], strict=True):
+for a, b in pairwise(times):
     y = solve_ivp(field, (a, b), y, "DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
 error = np.max(np.abs(found - y))
 print(f"{step.steps} steps, error {error:.1e}")

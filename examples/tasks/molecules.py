@@ -1,5 +1,7 @@
 """A hundred molecules in a periodic box, and their relaxation to a minimum."""
 
+from typing import Any
+
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
@@ -66,11 +68,11 @@ assert error < 1e-6
 damped = dps.MechanicalSystem(
     dps.QuadraticKinetic(), potential, friction=dps.ConstantDamping(1.0)
 )
-rest = dfx.diffeqsolve(
+rest: Any = dfx.diffeqsolve(
     *(damped, dps.PresymplecticLeapfrog(), 0.0, 200.0, 0.03, (jnp.asarray(q), 0 * q)),
     adjoint=dps.FixedStepAdjoint(),
     max_steps=None,
-).ys[0][-1]
-left = np.max(np.abs(force(np.asarray(rest))))
+)
+left = np.max(np.abs(force(np.asarray(rest.ys[0][-1]))))
 print(f"at rest the largest force is {left:.1e}")
 assert left < 1e-3

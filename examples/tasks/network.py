@@ -25,7 +25,7 @@ system = dps.MechanicalSystem(
 )
 q0 = jnp.asarray(rng.normal(size=n))
 y0 = q0, jnp.zeros(n)
-ts = np.linspace(0.0, 20.0, 201)
+ts = jnp.linspace(0.0, 20.0, 201)
 
 
 @jax.jit

@@ -31,7 +31,7 @@ def acceleration(t, q, args):
 
 # `p` is the momentum per unit mass, so that none is divided by zero.
 system = dps.MechanicalSystem(dps.QuadraticKinetic(), dps.ForceField(acceleration))
-ts = np.linspace(0.0, 200.0, 21)
+ts = jnp.linspace(0.0, 200.0, 21)
 
 
 @jax.jit

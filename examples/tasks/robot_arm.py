@@ -1,6 +1,8 @@
 """An arm with two joints and a mass matrix M(q): a network as its motor, trained to
 bring it to rest upright."""
 
+from typing import Any
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -32,10 +34,10 @@ arm = dps.LagrangianSystem(
     mass_matrix, potential, friction=dps.ViscousDamping(0.1), force=motor
 )
 q0, v0 = jnp.array([0.5, -0.3]), jnp.zeros(2)
-ts = np.linspace(0.0, 5.0, 21)
+ts = jnp.linspace(0.0, 5.0, 21)
 
 
-def solve(network, adjoint):
+def solve(network, adjoint) -> Any:
     return dfx.diffeqsolve(
         *(arm, dps.PresymplecticGauss(2), 0.0, 5.0, 0.1),
         arm.from_velocity(0.0, (q0, v0)),

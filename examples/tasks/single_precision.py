@@ -15,7 +15,7 @@ system = dps.MechanicalSystem(
     friction=dps.ConstantDamping(0.1),
 )
 y0 = jnp.array([2.0]), jnp.array([0.0])
-ts = np.linspace(0.0, 30.0, 61)
+ts = jnp.linspace(0.0, 30.0, 61)
 
 
 @jax.jit

@@ -28,7 +28,7 @@ pendulum = dps.MechanicalSystem(
 polar, azimuth, v0 = 2.0, 0.0, 1.5  # from upright; the velocity is horizontal
 q0 = jnp.array([jnp.sin(polar), 0.0, jnp.cos(polar)])
 y0 = q0, jnp.array([0.0, v0, 0.0])
-ts = np.linspace(0.0, 20.0, 101)
+ts = jnp.linspace(0.0, 20.0, 101)
 
 
 @jax.jit
@@ -46,7 +46,7 @@ q, p = solve(step.dt0).ys
 
 
 def field(t, y):
-    polar, azimuth, w, u = y
+    polar, _, w, u = y
     sin, cos = np.sin(polar), np.cos(polar)
     acceleration = sin * cos * u**2 + gravity * sin - rate * w
     return [w, u, acceleration, -2 * cos / sin * w * u - rate * u]
