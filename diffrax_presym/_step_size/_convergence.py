@@ -1,5 +1,7 @@
 """Convergence of solves with more and more steps, and the fewest that suffice."""
 
+import contextlib
+import logging
 import math
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -27,6 +29,17 @@ class _Trial(NamedTuple):
     error: float
 
 
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the traceback that JAX logs where a solve fails, as a trial may."""
+    logger = logging.getLogger("jax._src.callback")
+    disabled, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = disabled
+
+
 class Solution(NamedTuple):
     """What a solve saved, on the host."""
 
@@ -40,7 +53,8 @@ class Solution(NamedTuple):
     @classmethod
     def of(cls, number: int, solve: Callable[[float], Any], step) -> "Solution":
         try:
-            sol = jax.block_until_ready(solve(step))
+            with _quiet():
+                sol = jax.block_until_ready(solve(step))
         except RuntimeError:  # as `diffeqsolve` raises if a solve fails
             return cls(number, number, np.zeros(0), [], False, None)
         if not isinstance(sol, dfx.Solution):
