@@ -60,7 +60,7 @@ def pendulum():
 
 def solver_of(system, solver, dt0=0.25, throw=False, **kwargs):
     """The solve of a batch of initial states, from `y0` to the state at `T1`."""
-    own = dt0 is not None and isinstance(solver, AbstractPresymplecticSolver)
+    own = isinstance(solver, AbstractPresymplecticSolver)
     if own and "event" not in kwargs:  # the loop of Diffrax takes events
         kwargs.setdefault("adjoint", dps.FixedStepAdjoint())
 
