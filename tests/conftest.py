@@ -64,3 +64,16 @@ def pytest_collection_modifyitems(config, items):
         own = lambda item: zlib.crc32(item.nodeid.encode()) % parts == part % parts
         config.hook.pytest_deselected(items=[x for x in items if not own(x)])
         items[:] = filter(own, items)
+
+
+def pytest_terminal_summary(terminalreporter):
+    """How many pairs of entries of the catalogue were tried, and how many refused."""
+    reports = terminalreporter.getreports("passed")
+    properties = [x for report in reports for x in report.user_properties]
+    rows = [value for name, value in properties if name == "pairs"]
+    refused = sum(value for name, value in properties if name == "refused")
+    pairs = len(set().union(*rows))
+    terminalreporter.write_line(
+        f"{len(rows)} rows of {pairs} pairs of entries of the catalogue are right, "
+        f"{refused} combinations are refused"
+    )

@@ -1,8 +1,9 @@
-"""Deliberate errors, and whether the catalogue finds them.
+"""Deliberate errors, and whether the tests find them.
 
 `python tests/mutants.py [NAME ...]` applies each to a copy of the package, runs a
-sample of the pairs alone, and prints found or missed. An error is found if a test
-fails.
+sample of the pairs of the catalogue alone, and prints found or missed. An error is
+found if a test fails. What is not part of a pair, as a potential or a benchmark, is
+looked for by the tests that an error names.
 """
 
 import argparse
@@ -23,6 +24,7 @@ class Mutant(NamedTuple):
     file: str  # in the package
     old: str
     new: str
+    tests: str = "test_pairs.py"
 
 
 MUTANTS = [
@@ -143,10 +145,23 @@ MUTANTS = [
         "np.stack([start, end, length], axis=-1)",
     ),
     Mutant(
-        "lost digits have the wrong sign",
+        "a wrapper mixes up what it carries",
         "_scheme/_moves.py",
         "return (system.values(y), (carry, rounding_errors(y))), None",
         "return (system.values(y), (rounding_errors(y), carry)), None",
+    ),
+    Mutant(
+        "a wrapper drops what its base has between steps",
+        "_scheme/_compensated.py",
+        "between=None if base.between is None else between,",
+        "between=None,",
+    ),
+    Mutant(
+        "a stage backwards in time may amplify without limit",
+        "_scheme/_engine.py",
+        "bad = grown > 1 / math.sqrt(friction.precision)",
+        "bad = grown < 0",
+        "test_silent_errors.py",
     ),
     # The loop and its gradient.
     Mutant(
@@ -203,6 +218,42 @@ MUTANTS = [
         "at = at.add(*self._pull_point(i, n, point, row))",
         "at = at.add(tree_zeros(at.gradient), tree_zeros(at.bar))",
     ),
+    Mutant(
+        "an infinite span takes no step",
+        "_loop/_steps.py",
+        "jnp.where(finite, numbers, 0).astype(int), most)",
+        "jnp.where(finite, numbers, 0).astype(int), 0)",
+        "test_silent_errors.py",
+    ),
+    # Forces.
+    Mutant(
+        "a wrong sign in a force term",
+        "_system/_lagrangian.py",
+        "return kinetic - self._potential(t, q, args)",
+        "return -kinetic - self._potential(t, q, args)",
+    ),
+    Mutant(
+        "the distance of a particle to itself has a derivative",
+        "_system/_pairwise.py",
+        "jnp.sqrt(jnp.where(apart, square, 1))",
+        "jnp.sqrt(square)",
+        "test_silent_errors.py",
+    ),
+    Mutant(
+        "the energy of a particle with itself is that at the distance one",
+        "_system/_pairwise.py",
+        "jnp.where(same, lax.stop_gradient(following)[:, None], square)",
+        "jnp.where(same, 1, square)",
+        "test_silent_errors.py",
+    ),
+    # Diagnostics.
+    Mutant(
+        "the fastest solve is taken without a look at its error",
+        "diagnostics/_work_precision.py",
+        "[run for run in self.runs if run.error <= error]",
+        "list(self.runs)",
+        "test_work_precision.py",
+    ),
     # What is refused.
     Mutant(
         "Nystrom splittings take friction by place",
@@ -225,7 +276,8 @@ def found(mutant: Mutant, rows: int) -> bool:
         assert mutant.old in text, f"{mutant.name}: not found in {mutant.file}"
         path.write_text(text.replace(mutant.old, mutant.new))
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "2"]
-        command += ["-m", "not slow", "-p", "no:cacheprovider", "tests/test_pairs.py"]
+        command += ["-p", "no:cacheprovider", f"tests/{mutant.tests}"]
+        command += ["-m", "not slow"] if mutant.tests == "test_pairs.py" else []
         environment = os.environ | {"PYTHONPATH": folder, "ROWS": str(rows)}
         run = subprocess.run(
             command, cwd=copy, env=environment, capture_output=True, text=True
@@ -236,7 +288,7 @@ def found(mutant: Mutant, rows: int) -> bool:
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", help="words in the names of some of them")
-    parser.add_argument("--rows", type=int, default=24, help="the size of the sample")
+    parser.add_argument("--rows", type=int, default=48, help="the size of the sample")
     options = parser.parse_args()
     number = 0
     chosen = [
