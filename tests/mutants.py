@@ -282,7 +282,11 @@ def found(mutant: Mutant, rows: int) -> bool:
         run = subprocess.run(
             command, cwd=copy, env=environment, capture_output=True, text=True
         )
-        return run.returncode == 1
+        # Where the first failure ends a run of several processes, the status is 2.
+        failed, passed = (word in run.stdout for word in ("FAILED tests", "passed in"))
+        if not failed and (run.returncode or not passed):
+            raise RuntimeError(f"The tests did not run:\n{run.stdout[-2000:]}")
+        return failed
 
 
 def main():

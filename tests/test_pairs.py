@@ -81,7 +81,7 @@ def covering() -> list[dict]:
                 rng.shuffle(options)
                 row = max(options, key=lambda x: len(pairs(x) - seen))
         seen.update(pairs(row))
-        return row
+        return {name: row[name] for name in FACTORS}
 
     table = []
     for scheme, friction in itertools.product(*list(FACTORS.values())[:2]):
@@ -92,6 +92,7 @@ def covering() -> list[dict]:
     triples = itertools.product(*list(FACTORS.values())[:3])
     triples = [dict(zip(FACTORS, x, strict=False)) for x in triples]
     triples = list(filter(possible, triples))
+    rng.shuffle(triples)
     for names in itertools.combinations(FACTORS, 2):
         for entries in itertools.product(*(FACTORS[name] for name in names)):
             pair = dict(zip(names, entries, strict=True))

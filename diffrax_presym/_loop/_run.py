@@ -76,8 +76,10 @@ class Problem(eqx.Module):
     @property
     def at_once(self) -> bool:
         """Whether outputs between steps are computed all at once after the last step,
-        from the states at the starts of these steps."""
-        return sum(jnp.size(x) for x in jtu.tree_leaves(self.start)) <= _LARGE
+        from the states at the starts of these steps. In implicit schemes they would all
+        iterate as often as the slowest."""
+        size = sum(jnp.size(x) for x in jtu.tree_leaves(self.start))
+        return size <= _LARGE and not self.scheme.is_implicit
 
     def prepare(self, system: System, backward: bool = False) -> PyTree:
         """What all steps share, if anything."""

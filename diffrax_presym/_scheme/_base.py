@@ -42,6 +42,8 @@ class Scheme(NamedTuple):
     # and at the end of a solve, whether its steps can. `None` if always.
     is_invertible: bool = True
     undoable: Callable[[PyTree, PyTree], Array] | None = None
+    # Whether a step solves equations by iteration.
+    is_implicit: bool = False
     # Why steps of unequal length must not be composed: these cancel errors only if the
     # errors are even in the step size.
     not_composable: str | None = None

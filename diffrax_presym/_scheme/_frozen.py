@@ -93,7 +93,8 @@ class PresymplecticEuler(AbstractPresymplecticSolver):
 
     def scheme(self, system: System) -> Scheme:
         moves = _momentum_first(self, system)
-        return Scheme(moves if self.first == "momentum" else inverse(moves))
+        moves = moves if self.first == "momentum" else inverse(moves)
+        return Scheme(moves, is_implicit=not system.is_separable)
 
 
 PresymplecticEuler.__init__.__doc__ = _ARGUMENTS
@@ -154,7 +155,7 @@ class PresymplecticLeapfrog(AbstractPresymplecticSolver):
         A = _momentum_first(self, system)
         B = A.inverse
         if not system.is_separable:
-            return Scheme(Stages([B, A], halves))
+            return Scheme(Stages([B, A], halves), is_implicit=True)
         # Two kicks at the same position are merged.
         (kick, drift), (drift_end, _) = A.moves, B.moves
         table = [(0, 0.5, 0.5), (0.5, 0.5, 1), (0.5, 1, 0.5)]

@@ -346,7 +346,7 @@ class PresymplecticGauss(AbstractPresymplecticSolver):
             zero = jnp.zeros((), jnp.result_type(t))
             return _Carry(tree_zeros(y), jtu.tree_map(many, y), zero)
 
-        return Scheme(move, start=start)
+        return Scheme(move, start=start, is_implicit=True)
 
 
 def _check_number(x, most: int | None, name: str) -> None:
