@@ -136,7 +136,10 @@ class _ScaledKinetic(AbstractKinetic):
         return self.kinetic.is_quadratic
 
     def _parts(self, t: Time):
-        eta2 = self.eta2(t)
+        # Where it is minus infinity, as of 3 / t at zero, its derivatives are not finite.
+        infinite = jnp.isneginf(self.eta2(t))
+        eta2 = self.eta2(jnp.where(infinite, t + 1, t))
+        eta2 = jnp.where(infinite, -jnp.inf, eta2)
         return jnp.exp(eta2 - self.eta1(t)), self.kinetic.rescale(eta2)
 
     def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
