@@ -136,7 +136,7 @@ class _ScaledKinetic(AbstractKinetic):
         return self.kinetic.is_quadratic
 
     def _parts(self, t: Time):
-        # Where it is minus infinity, as of 3 / t at zero, its derivatives are not finite.
+        # Where it is minus infinity, as of 3 / t at zero, it has no derivatives.
         infinite = jnp.isneginf(self.eta2(t))
         eta2 = self.eta2(jnp.where(infinite, t + 1, t))
         eta2 = jnp.where(infinite, -jnp.inf, eta2)
