@@ -233,22 +233,21 @@ def _walk(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
         success = jtu.tree_map(jnp.asarray, dfx.RESULTS.successful)
         start = eqx.tree_at(lambda x: x.result, start, success, is_leaf=_is_none)
 
-    def advance_to(stop: Array, progress: Progress) -> Progress:
-        def more(progress: Progress) -> Bool[Array, ""]:
-            left = progress.n < stop
-            if not can_fail:
-                return left
-            return left & (progress.result == dfx.RESULTS.successful)
+    def unfinished(progress: Progress, stop: Array) -> Bool[Array, ""]:
+        left = progress.n < stop
+        if not can_fail:
+            return left
+        return left & (progress.result == dfx.RESULTS.successful)
 
+    def advance_to(stop: Array, progress: Progress) -> Progress:
         if not (cheap_iterations() or can_fail):
             block = lambda x: lax.fori_loop(0, _BLOCK, lambda _, x: step(x), x)
             several = lambda progress: progress.n + _BLOCK <= stop
             progress = lax.while_loop(several, block, progress)
-        return lax.while_loop(more, step, progress)
+        return lax.while_loop(lambda x: unfinished(x, stop), step, progress)
 
     is_track = lambda x: isinstance(x, Track)
     flat, structure = jtu.tree_flatten(tracks, is_leaf=is_track)
-    alone = len(flat) == 1
     due = lambda states: [
         track.next_stop(j, last + 1) for track, (j, _) in zip(flat, states, strict=True)
     ]
@@ -256,19 +255,23 @@ def _walk(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
     def stop(x):
         progress, states = x
         wanted = due(states)
-        at = reduce(jnp.minimum, wanted)
+        at = reduce(jnp.minimum, wanted, last)
         progress, new = advance_to(at, progress), []
         for track, (j, rows), next_stop in zip(flat, states, wanted, strict=True):
-            here = True if alone else next_stop == at
+            here = next_stop == at
             rows = _put(rows, j, track.value(j, progress.point), here)
             new.append((jnp.where(here, j + 1, j), rows))
         return progress, new
 
-    more = lambda x: reduce(jnp.minimum, due(x[1])) <= last
+    def more(x):
+        progress, states = x
+        return unfinished(progress, last) | (reduce(jnp.minimum, due(states)) <= last)
+
     states = [track.start() for track in flat]
-    if flat:
-        start, states = lax.while_loop(more, stop, (start, states))
-    end = advance_to(last, start)
+    if not flat:
+        return advance_to(last, start), jtu.tree_unflatten(structure, [])
+    # The end is a stop too, so that there is one loop over steps.
+    end, states = lax.while_loop(more, stop, (start, states))
     return end, jtu.tree_unflatten(structure, [rows for _, rows in states])
 
 

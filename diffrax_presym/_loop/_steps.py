@@ -1,5 +1,7 @@
 """The steps of a solve that are known beforehand, and in which of them it is saved."""
 
+from typing import Any
+
 import diffrax as dfx
 import equinox as eqx
 import jax.numpy as jnp
@@ -96,10 +98,12 @@ class Steps(eqx.Module):
             self.starts, self.first = t0[None], jnp.zeros(1, int)
             self.length = jnp.zeros_like(self.starts)
             return
-        inner = controller.times if isinstance(controller, StepsBetween) else []
-        inner = jnp.clip(jnp.sort(jnp.asarray(inner, t0.dtype)), t0, t1)
-        self.starts = jnp.concatenate([t0[None], inner])
-        spans = jnp.concatenate([inner, t1[None]]) - self.starts
+        self.starts, ends = t0[None], t1[None]
+        if isinstance(controller, StepsBetween):
+            inner = jnp.clip(jnp.sort(controller.times.astype(t0.dtype)), t0, t1)
+            self.starts = jnp.concatenate([self.starts, inner])
+            ends = jnp.concatenate([inner, ends])
+        spans = ends - self.starts
         # As few equal steps as are not longer than `dt0`, but for rounding.
         eps, most = float(jnp.finfo(t0.dtype).eps), _MOST_STEPS
         numbers = jnp.ceil(spans / dt0 * (1 - 2 * eps))
@@ -108,16 +112,16 @@ class Steps(eqx.Module):
         counts = jnp.where(finite, jnp.where(finite, numbers, 0).astype(int), most)
         several = jnp.where(finite, jnp.maximum(numbers, 1), 1)
         self.length = jnp.where(finite, spans / several, dt0)
-        ends = jnp.cumsum(counts)
-        self.first, self.total = ends - counts, ends[-1]
+        last = counts if len(counts) == 1 else jnp.cumsum(counts)
+        self.first, self.total = last - counts, last[-1]
 
     @property
     def are_equal(self) -> bool:
         return self.ts is None and len(self.starts) == 1
 
-    def _part(self, n: Int[Array, "..."]) -> Int[Array, "..."]:
+    def _part(self, n: Int[Array, "..."]) -> Any:
         if len(self.starts) == 1:
-            return jnp.zeros_like(n)
+            return 0
         return jnp.searchsorted(self.first, n, side="right").astype(int) - 1
 
     def time(self, n: Int[Array, "..."]) -> Float[Array, "..."]:
@@ -137,30 +141,33 @@ class Steps(eqx.Module):
             return Span(t0, t1, t1 - t0)
         return Span(t0, t1, system.time(self.length[self._part(n)]))
 
-    def containing(self, ts: Float[Array, " times"]) -> Int[Array, " times"]:
-        """The step in which each time is, its end included, its start not."""
-        if self.ts is not None:
-            return jnp.searchsorted(self.ts[1:], ts).astype(int)
-        k = jnp.searchsorted(self.starts[1:], ts).astype(int)
-        length = jnp.where(self.length > 0, self.length, 1)[k]
-        n = self.first[k] + jnp.ceil((ts - self.starts[k]) / length).astype(int) - 1
-        # The quotient is rounded.
-        n = jnp.where(self.time(n) >= ts, n - 1, n)
-        n = jnp.where(self.time(n + 1) < ts, n + 1, n)
-        return jnp.clip(n, 0, jnp.maximum(self.total - 1, 0))
+    def locate(
+        self, ts: Float[Array, " times"]
+    ) -> tuple[Int[Array, " times"], Bool[Array, " times"]]:
+        """The step at whose start each time is, or the one that it is inside of; and
+        whether it is inside.
 
-    def is_start(
-        self, n: Int[Array, " times"], ts: Float[Array, " times"]
-    ) -> Bool[Array, " times"]:
-        """Whether times are the start of step `n`, to rounding.
-
-        Equally spaced times may be computed in another order, and rounded otherwise.
+        Equally spaced times may be computed in another order, and rounded otherwise: a
+        time is the start of a step if it is so to rounding.
         """
+        if self.ts is None:
+            k: Any = 0
+            if len(self.starts) > 1:
+                k = jnp.searchsorted(self.starts[1:], ts).astype(int)
+            length = jnp.where(self.length > 0, self.length, 1)[k]
+            n = self.first[k] + jnp.round((ts - self.starts[k]) / length).astype(int)
+            n = jnp.clip(n, 0, self.total)
+        else:
+            after = jnp.clip(jnp.searchsorted(self.ts, ts), 1, len(self.ts) - 1)
+            before, next = self.ts[after - 1], self.ts[after]
+            length = next - before
+            n = jnp.where(ts - before < next - ts, after - 1, after).astype(int)
         start = self.time(n)
         largest = jnp.maximum(jnp.abs(self.t0), jnp.abs(start))
         rounding = 4 * jnp.finfo(start.dtype).eps * largest
-        length = jnp.maximum(self.time(n + 1) - start, start - self.time(n - 1))
-        return jnp.abs(ts - start) <= jnp.minimum(rounding, length / 64)
+        inside = jnp.abs(ts - start) > jnp.minimum(rounding, length / 64)
+        inside &= self.total > 0
+        return jnp.where(inside & (ts < start), n - 1, n), inside
 
 
 class Rows(eqx.Module):
@@ -176,11 +183,9 @@ class Rows(eqx.Module):
         times, stops, insides = [], [], []
         self.may_be_inside = sub.ts is not None and len(sub.ts) > 0
         if sub.ts is not None:
-            n = steps.containing(sub.ts)
-            ends = steps.is_start(n + 1, sub.ts) & (steps.total > 0)
             times.append(sub.ts)
-            stops.append(jnp.where(ends, n + 1, n))
-            insides.append(~ends & ~steps.is_start(n, sub.ts) & (steps.total > 0))
+            for known, x in zip((stops, insides), steps.locate(sub.ts), strict=True):
+                known.append(x)
         number = 0 if sub.ts is None else len(sub.ts)
         if sub.steps:
             assert max_steps is not None  # as Diffrax has checked
