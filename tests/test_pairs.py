@@ -363,15 +363,18 @@ def check_composition(scheme, wrapper):
 
 # Which are tried when.
 
+# The number of rows, and entries that they all have.
 SAMPLE = int(os.environ.get("ROWS", 6))
+ENTRIES = set(os.environ.get("ENTRIES", "").split("|")) - {""}
 
 
 def sample() -> list[dict]:
     """Some rows, others for each commit, that have as many entries as possible."""
-    rest, chosen, seen = list(covering()), [], set()
+    rest = [x for x in covering() if {*map(str, x.values())} >= ENTRIES]
     random.Random(seed()).shuffle(rest)
     entries = lambda row: set(map(str, row.items()))
-    for _ in range(SAMPLE):
+    chosen, seen = [], set()
+    for _ in range(min(SAMPLE, len(rest))):
         row = max(rest, key=lambda row: len(entries(row) - seen))
         seen = seen | entries(row) if entries(row) - seen else entries(row)
         rest.remove(row)
