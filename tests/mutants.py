@@ -70,7 +70,7 @@ MUTANTS = [
         "_friction/_log_scale.py",
         "Integral(start + h, x, 1.0)",
         "Integral(start + h, x, -1.0)",
-        ("any T, springs",),
+        ("any T, springs", "3 / t"),
     ),
     Mutant(
         "an order of quadrature too low",
