@@ -687,8 +687,8 @@ FRICTION = [
     ),
     Friction(
         "[constant, drag]",
-        _some(lambda s: [_constant(s), dps.Drag(0.4)]),
-        _sum(_constant_force, lambda s, t, q, p, v: _drag_numpy(s, v)),
+        _some(lambda s: [_constant(s), dps.Drag(0.4, medium=0.3)]),
+        _sum(_constant_force, lambda s, t, q, p, v: _drag_numpy(s, v - 0.3)),
         "drag",
         needs="bodies",
     ),

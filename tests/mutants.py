@@ -68,9 +68,9 @@ MUTANTS = [
     Mutant(
         "a wrong sign in an integral",
         "_friction/_log_scale.py",
-        "Integral(start + h, x, 1.0)",
-        "Integral(start + h, x, -1.0)",
-        ("any T, springs", "3 / t"),
+        "return Exponents(x, Integral(start, x, -1.0),",
+        "return Exponents(x, Integral(start, x, 1.0),",
+        ("3 / t",),
     ),
     Mutant(
         "an order of quadrature too low",
@@ -119,7 +119,7 @@ MUTANTS = [
         "_friction/_drag.py",
         "p / mass - w",
         "p / mass + w",
-        ("drag",),
+        ("[constant, drag]",),
     ),
     # Moves.
     Mutant(
@@ -172,11 +172,11 @@ MUTANTS = [
         ("Compensated",),
     ),
     Mutant(
-        "a wrapper drops what its base has between steps",
+        "a wrapper passes on the wrong part of what it carries",
         "_scheme/_compensated.py",
-        "between=None if base.between is None else between,",
-        "between=None,",
-        ("multistep 8", "Compensated"),
+        "end_force=lambda carry: base.end_force(carry[0]),",
+        "end_force=lambda carry: base.end_force(carry[1][0]),",
+        ("Diffrax's loop, dense", "Compensated"),
     ),
     Mutant(
         "a stage backwards in time may amplify without limit",
@@ -210,8 +210,8 @@ MUTANTS = [
     Mutant(
         "a last step is left out",
         "_loop/_steps.py",
-        "self.first, self.total = ends - counts, ends[-1]",
-        "self.first, self.total = ends - counts, ends[-1] - 1",
+        "self.first, self.total = last - counts, last[-1]",
+        "self.first, self.total = last - counts, last[-1] - 1",
         ("end",),
     ),
     Mutant(
@@ -226,7 +226,7 @@ MUTANTS = [
         "_loop/_backward.py",
         "gradient = tree_sum(gradient, self._pull_prepared(fn, prepared))",
         "gradient = gradient",
-        ("eta(t)", "reversal"),
+        ("2 / (t + 1)", "reversal"),
     ),
     Mutant(
         "the cotangent of what all steps share is dropped",
