@@ -263,10 +263,7 @@ def _walk(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
             new.append((jnp.where(here, j + 1, j), rows))
         return progress, new
 
-    def more(x):
-        progress, states = x
-        return unfinished(progress, last) | (reduce(jnp.minimum, due(states)) <= last)
-
+    more = lambda x: unfinished(x[0], last) | (reduce(jnp.minimum, due(x[1])) <= last)
     states = [track.start() for track in flat]
     if not flat:
         return advance_to(last, start), jtu.tree_unflatten(structure, [])
