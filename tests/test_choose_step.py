@@ -170,6 +170,21 @@ def test_a_step_that_is_too_large_is_no_error(solver, options, caplog):
     assert not caplog.records  # no traceback of a trial
 
 
+def test_a_failure_after_a_success_is_no_error():
+    # JAX then raises another exception.
+    stiff = system_of(lambda t, q, args: 1e3 * jnp.sum(q**4), 0.0)
+
+    @jax.jit
+    def solve(dt0):
+        options = {"adjoint": dps.FixedStepAdjoint(), "max_steps": None}
+        return dfx.diffeqsolve(stiff, RKN4, 0.0, 1.0, dt0, Y0, **options)
+
+    for _ in range(3):
+        solve(0.001)
+    step = dps.choose_step(solve, 0.0, 1.0, rtol=1e-4, atol=1e-4)
+    assert any(np.isinf(trial.error) for trial in step.trials)
+
+
 def test_single_precision():
     t0, t1, y0 = jax.tree.map(jnp.float32, (jnp.array(0.0), jnp.array(20.0), Y0))
     system = system_of(cosine, jnp.float32(0.1))

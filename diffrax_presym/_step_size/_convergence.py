@@ -55,7 +55,13 @@ class Solution(NamedTuple):
         try:
             with _quiet():
                 sol = jax.block_until_ready(solve(step))
-        except RuntimeError:  # as `diffeqsolve` raises if a solve fails
+        except (RuntimeError, ValueError) as error:
+            # As `diffeqsolve` raises if a solve fails. From the second call of a
+            # function on, `jax.jit` raises the same error as a `ValueError`.
+            if isinstance(error, ValueError) and "EquinoxRuntimeError" not in str(
+                error
+            ):
+                raise
             return cls(number, number, np.zeros(0), [], False, None)
         if not isinstance(sol, dfx.Solution):
             raise ValueError(
@@ -255,7 +261,7 @@ class Convergence:
             # Only the loop of the package tells the order.
             ways = ways[self.claimed is not None : 3 if precision == np.float32 else 2]
             raise RuntimeError(
-                f"`choose_step` cannot reach this tolerance in {precision} for sure: "
+                f"`choose_step` cannot reach this tolerance in {precision}: "
                 f"from {self._at} steps on, solves with more steps differ by rounding, "
                 f"by {self._least:.1e} times the tolerance or more. Use "
                 f"{', '.join(ways)} or a larger tolerance."

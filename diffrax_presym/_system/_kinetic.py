@@ -89,6 +89,11 @@ class QuadraticKinetic(AbstractKinetic):
             - A pytree of the structure of `p`, whose leaves are any of the above.
             - A `lineax.AbstractLinearOperator` acting on `p`'s space.
 
+            A test particle without mass has no momentum. Let `p` be the momentum per
+            unit mass of all bodies, `QuadraticKinetic()` with
+            `ForceField(acceleration)`; the energy is that of a second system, of the
+            bodies with mass.
+
         **Raises:**
 
         `ValueError` if a mass is known not to be positive, or if its shape does not fit

@@ -35,9 +35,8 @@ def fall(angle, dt0):
     )
 
 
-step = dps.choose_step(
-    lambda dt0: fall(angles[-1], dt0), 0.0, 20.0, rtol=1e-8, atol=1e-8
-)
+last = jax.jit(lambda dt0: fall(angles[-1], dt0))
+step = dps.choose_step(last, 0.0, 20.0, rtol=1e-8, atol=1e-8)
 sol = jax.jit(jax.vmap(fall, in_axes=(0, None)))(jnp.asarray(angles), step.dt0)
 times, speeds = sol.ts[:, 0], sol.ys[1][:, 0, 0]
 assert jnp.all(sol.result == dfx.RESULTS.event_occurred)
