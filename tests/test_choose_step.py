@@ -189,7 +189,7 @@ def test_single_precision():
     t0, t1, y0 = jax.tree.map(jnp.float32, (jnp.array(0.0), jnp.array(20.0), Y0))
     system = system_of(cosine, jnp.float32(0.1))
     assert choose(system, dps.Strang(), t0, t1, y0, 1e-3).error <= 1
-    with pytest.raises(RuntimeError, match="in float32 for sure") as error:
+    with pytest.raises(RuntimeError, match="in float32") as error:
         choose(system, RKN6, t0, t1, y0, 1e-8, ts=jnp.linspace(t0, t1, 81))
     instead = "`Compensated(solver)`", "'jax_enable_x64'"
     assert all(x in str(error.value) for x in instead)
