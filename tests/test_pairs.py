@@ -405,11 +405,12 @@ def test_refusals(scheme, record_property):
     record_property("refused", len(refusals()[scheme]))
 
 
-def test_some_refusals():
+def test_some_refusals(record_property):
     everything = [x for some in refusals().values() for x in some]
     number = min(20 * SAMPLE, len(everything))
     for refusal in random.Random(seed()).sample(everything, number):
         check_refusal(*refusal)
+    record_property("refused", number)
     for scheme, wrapper in itertools.product(catalogue.SCHEMES, catalogue.WRAPPERS):
         if wrapper.composes and not scheme.composable:
             check_composition(scheme, wrapper)
