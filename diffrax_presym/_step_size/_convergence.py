@@ -54,7 +54,7 @@ class Solution(NamedTuple):
     def of(cls, number: int, solve: Callable[[float], Any], step) -> "Solution":
         try:
             with _quiet():
-                sol = jax.block_until_ready(solve(step))
+                sol = jax.device_get(solve(step))
         except (RuntimeError, ValueError) as error:
             # As `diffeqsolve` raises if a solve fails. From the second call of a
             # function on, `jax.jit` raises the same error as a `ValueError`.
