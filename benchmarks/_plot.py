@@ -67,7 +67,7 @@ def error_against_time(results, groups, path, columns):
     }
     for ax, (problem, curves) in zip(axes, results.items(), strict=True):
         for name, curve in curves.items():
-            error, seconds = np.array(curve).T
+            error, seconds = np.array(curve).T[:2]
             form = {"ms": 3, "lw": 1, "color": color[name]}
             ax.loglog(error, seconds * 1e6, style[name], **form)
         ax.set(title=problem, xlabel="relative error at the final time")

@@ -37,10 +37,20 @@ def last(sol) -> Any:
 
 
 def states(
-    term, solver, times, y0, x, args=None, *, adaptive=False, density=None, **options
+    term,
+    solver,
+    times,
+    y0,
+    x,
+    args=None,
+    *,
+    adaptive=False,
+    density=None,
+    count=False,
+    **options,
 ) -> Any:
     """What is saved in `x` equal steps, or in adaptive ones with tolerance `x`: by
-    default the final state.
+    default the final state; and how many steps it took, if they `count`.
 
     Solvers of this package run in the loop of `FixedStepAdjoint`. With a step density
     the steps vary, and the first is one of `x` equal ones. The result is not a number
@@ -60,7 +70,8 @@ def states(
     sol = solve(term, solver, t0, t1, dt0, y0, args, **options)
     good = sol.result == dfx.RESULTS.successful
     ys = sol.ys if "saveat" in options else last(sol)
-    return jax.tree.map(lambda y: jnp.where(good, y, jnp.nan), ys)
+    ys = jax.tree.map(lambda y: jnp.where(good, y, jnp.nan), ys)
+    return (ys, sol.stats["num_steps"]) if count else ys
 
 
 def relative_error(y, exact):

@@ -74,15 +74,16 @@ def error_curves(
     error: Callable,
     repeats: int,
     enough: tuple[float, float] | None = None,
-) -> dict[Any, list[tuple[float, float]]]:
-    """The points `(error, seconds)` of every run, a solve and its sweep.
+    cost: Callable = lambda key, result: math.nan,
+) -> dict[Any, list[tuple[float, float, float]]]:
+    """The points `(error, seconds, cost)` of every run, a solve and its sweep.
 
     `error` maps what the solve returns to a number; points that are not finite are
-    omitted. Sweeps in order of cost end at an error that is small `enough`, or at a
-    run that takes so many seconds.
+    omitted. `cost` is of the run and of what the solve returns. Sweeps in order of cost
+    end at an error that is small `enough`, or at a run that takes so many seconds.
     """
     least, longest = (0.0, math.inf) if enough is None else enough
-    errors, calls = {}, {}
+    errors, costs, calls = {}, {}, {}
     for key, (solve, sweep) in runs.items():
         # The first call after another function's is slow to start.
         calls[key, None] = functools.partial(solve, sweep[0])
@@ -94,19 +95,20 @@ def error_curves(
             found = float(error(result))
             if math.isfinite(found):
                 errors[key, i], calls[key, i] = found, call
+                costs[key, i] = float(cost(key, result))
             if found < least / 3 or seconds > longest:
                 break
     timings = interleaved(calls, repeats, warm_up=False)
     curves = {key: [] for key in runs}
     for (key, i), found in errors.items():
-        curves[key].append((found, timings[key, i].median))
+        curves[key].append((found, timings[key, i].median, costs[key, i]))
     return {key: curve for key, curve in curves.items() if curve}
 
 
-def time_to(curve, target):
-    """The least time to reach an error, between the points on a log scale."""
+def least_to(curve, target, by=1):
+    """The least time, or cost, to reach an error, between the points on a log scale."""
     best = math.inf
-    points = sorted(curve, key=lambda point: point[1])
+    points = sorted(((p[0], p[by]) for p in curve), key=lambda point: point[1])
     for i, (error, seconds) in enumerate(points):
         if error <= target:
             best = min(best, seconds)
@@ -119,10 +121,10 @@ def time_to(curve, target):
     return best
 
 
-def fastest(curves, target, group):
+def fastest(curves, target, group, by=1):
     """The least time to reach an error of a group of `(group, name)`, and its name."""
     found = (
-        (time_to(curve, target), name)
+        (least_to(curve, target, by), name)
         for (kind, name), curve in curves.items()
         if kind == group
     )

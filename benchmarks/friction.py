@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from _report import command_line, means, Table
 from _schemes import DIFFRAX, SCHEMES
-from _solve import MOST, reference_end, relative_error, solve, states
+from _solve import reference_end, relative_error, states
 from _timing import error_curves, fastest, interleaved
 from problems import mechanics
 
@@ -150,19 +150,16 @@ def exact_solution(problem):
 
 
 def work(problem, quick):
-    """For every solver its points `(error, seconds)` and `(error, evaluations)`."""
+    """For every solver its points `(error, seconds, evaluations)`."""
     times = jnp.array([0.0, problem.t1])
-    run_one = eqx.filter_jit(states)
+    run_one = eqx.filter_jit(partial(states, count=True))
     exact = exact_solution(problem)
-    runs, evaluations = {}, {}
+    runs, cost_of = {}, {}
 
     def add(key, solver, cost, sweep, adaptive=False):
         sweep = [jnp.asarray(float(x)) for x in sweep]
         run = partial(run_one, problem.system, solver, times, problem.y0)
-        runs[key] = partial(run, adaptive=adaptive), sweep
-        fixed = problem.system, solver, problem.t1, problem.y0
-        steps = partial(_adaptive_steps, *fixed) if adaptive else float
-        evaluations[key] = [cost * int(steps(x)) for x in sweep]
+        runs[key], cost_of[key] = (partial(run, adaptive=adaptive), sweep), cost
 
     periods = problem.t1 / problem.fastest
     points, most = (5, 100) if quick else (9, 800)
@@ -177,20 +174,9 @@ def work(problem, quick):
         per_period = np.geomspace(10, most, points)
         steps = np.unique(np.ceil(periods * per_period / cost))
         add(("Diffrax", name + ", constant"), solver, cost, steps)
-    error = lambda y: relative_error(y, exact)
-    curves, costs = error_curves(runs, error, 2 if quick else 3), {}
-    for key in curves:
-        found = [float(error(runs[key][0](x))) for x in runs[key][1]]
-        pairs = zip(found, evaluations[key], strict=True)
-        costs[key] = [pair for pair in pairs if math.isfinite(pair[0])]
-    return curves, costs
-
-
-@eqx.filter_jit
-def _adaptive_steps(system, solver, t1, y0, tolerance):
-    control = dfx.PIDController(rtol=tolerance, atol=tolerance)
-    problem = system, solver, 0.0, t1, None, y0
-    return solve(*problem, controller=control, max_steps=MOST).stats["num_steps"]
+    error = lambda found: relative_error(found[0], exact)
+    evaluations = lambda key, found: cost_of[key] * found[1]
+    return error_curves(runs, error, 2 if quick else 3, cost=evaluations)
 
 
 _SHORT = {
@@ -214,9 +200,10 @@ def compare(problems, quick):
     )
     short = lambda found: " ".join(str(_SHORT.get(name, name)) for _, name in found)
     for problem in problems:
-        for kind, curves in zip(rows, work(problem, quick), strict=True):
+        curves = work(problem, quick)
+        for by, kind in enumerate(rows, 1):
             ours, theirs = (
-                [fastest(curves, target, group) for target in TARGETS]
+                [fastest(curves, target, group, by) for target in TARGETS]
                 for group in ("ours", "Diffrax")
             )
             best = [np.array([cost for cost, _ in found]) for found in (ours, theirs)]

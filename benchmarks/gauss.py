@@ -23,7 +23,7 @@ import numpy as np
 from _report import command_line, means, Table
 from _schemes import DIFFRAX
 from _solve import reference_end, relative_error, solve, states
-from _timing import error_curves, fastest, interleaved, time_to
+from _timing import error_curves, fastest, interleaved, least_to
 
 import diffrax_presym as dps
 
@@ -170,7 +170,7 @@ def compare(options):
         titles = (f"{target:.0e}:>9.2f" for target in TARGETS)
         table = Table(f"{problem}: milliseconds to an error", "solver:<18", *titles)
         for (_, name), curve in found.items():
-            table.row(name, *(1e3 * time_to(curve, target) for target in TARGETS))
+            table.row(name, *(1e3 * least_to(curve, target) for target in TARGETS))
         best = {
             group: np.array([fastest(found, target, group)[0] for target in TARGETS])
             for group in ("Gauss", *ratios)

@@ -23,7 +23,7 @@ from _plot import error_against_time, FOLDER, panels, save
 from _report import command_line, Table
 from _schemes import Scheme, SCHEMES
 from _solve import reference_end, relative_error, solve, states
-from _timing import error_curves, time_to
+from _timing import error_curves, least_to
 
 import diffrax_presym as dps
 
@@ -119,7 +119,7 @@ def print_speed(curves, targets=(1e-3, 1e-6, 1e-9)):
         table = Table("", f"{problem}, microseconds to an error of:<50", *columns)
         for name in PROBLEMS[problem][-2]:
             curve = schemes.get(name, [])
-            table.row(f"  {name}", *(1e6 * time_to(curve, x) for x in targets))
+            table.row(f"  {name}", *(1e6 * least_to(curve, x) for x in targets))
 
 
 @eqx.filter_jit

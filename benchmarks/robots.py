@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from _report import command_line, Table
 from _solve import states
-from _timing import error_curves, time_to
+from _timing import error_curves, least_to
 
 import diffrax_presym as dps
 
@@ -102,7 +102,7 @@ def main():
             *("solver:<30", *(f"{target:.0e}:>9.2f" for target in TARGETS)),
         )
         for name, curve in curves.items():
-            times = (time_to(curve, target) for target in TARGETS)
+            times = (least_to(curve, target) for target in TARGETS)
             table.row(name, *(1e3 * x for x in times))
 
 

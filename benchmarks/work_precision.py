@@ -13,11 +13,15 @@ the package was tuned on the test half. Where bodies attract each other, splitti
 also run with the variable steps of `StepDensityController` and `DistanceDensity`, as
 the documentation advises for close encounters. `--saved` saves at 201 times, where the
 error is the largest over these, relative to the largest entry of the solution.
+`--raised` raises XLA's limit for loops that it compiles into one function on a CPU, for
+every method, as docs/speed.md explains. A further table has the ratio of the numbers of
+force evaluations. That of schemes which are not explicit is an estimate.
 """
 
 import concurrent.futures
 import math
 import multiprocessing
+import os
 import pathlib
 import platform
 import time
@@ -65,19 +69,20 @@ SETS = {
     "test": problems_test.PROBLEMS,
 }
 SAVED = 201
+RAISED = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000"
 GROUPS = ("ours", "Diffrax", "heyoka")
 
 
 def solver_of(problem, solver, terms=None, ts=None, **options):
     """`solve(x)`, with `x` the number of steps, or the tolerance.
 
-    It returns the final state, or those at all of `ts`.
+    It returns the final state, or those at all of `ts`, and the number of steps.
     """
     if ts is not None:
         options["saveat"] = dfx.SaveAt(ts=jnp.asarray(ts))
     terms = problem.system if terms is None else terms
     args = terms, solver, (0.0, problem.t1), problem.y0
-    return jax.jit(lambda x: states(*args, x, **options))
+    return jax.jit(lambda x: states(*args, x, count=True, **options))
 
 
 def semi_implicit_euler(problem, ts=None):
@@ -91,8 +96,8 @@ def semi_implicit_euler(problem, ts=None):
     end = jnp.asarray(problem.t1 if ts is None else ts)
 
     def run(x):
-        q, P = solve(x)
-        return q, mechanical(end, P)
+        (q, P), steps = solve(x)
+        return (q, mechanical(end, P)), steps
 
     return jax.jit(run)
 
@@ -152,8 +157,23 @@ def all_runs(problem, quick, ts=None):
     return runs | {("heyoka", name): run for name, run in outside.items()}
 
 
+def evaluations(t1, ts, key, found):
+    """Of the force in a solve. Each saved time within a step costs as much as a step,
+    except with Gauss collocation, the multistep method and the solvers of Diffrax."""
+    (group, name), steps = key, found[1]
+    known = {"SemiImplicitEuler": 1, "heyoka": math.nan}
+    known |= {x: scheme.evaluations for x, scheme in (SCHEMES | DIFFRAX).items()}
+    known |= {x: scheme.evaluations for x, scheme in OTHERS.items()}
+    cost = known[name if name in known else name.split(",")[0]]
+    free = group != "ours" or "Gauss" in name or "Multistep" in name
+    if ts is None or free:
+        return cost * steps
+    at = ts / t1 * steps
+    return cost * (steps + np.sum(np.abs(at - np.round(at)) > 1e-6))
+
+
 def tables(results):
-    ratios, heyoka = [], []
+    ratios, heyoka, work = [], [], []
     for target in TARGETS:
         label = f"to an error of {target:.0e}:<22"
         table = Table("", label, "ours:>19", "us:>6.0f", "Diffrax's:>19", "us:>6.0f")
@@ -166,12 +186,18 @@ def tables(results):
         over = lambda a, b: a / b if max(a, b) < math.inf else None
         ratios.append([over(theirs, ours) for ours, theirs, _ in both])
         heyoka.append([over(ours, taylor) for ours, _, taylor in both])
+        costs = [
+            [fastest(curves, target, group, 2)[0] for group in ("Diffrax", "ours")]
+            for curves in results.values()
+        ]
+        work.append([over(*both) for both in costs])
     columns = [f"{target:.0e}:>7.2f" for target in TARGETS]
     captions = (
         "Best Diffrax solver over our best",
+        "The same of force evaluations",
         "Our best over heyoka, one trajectory",
     )
-    for caption, columns_of in zip(captions, (ratios, heyoka), strict=True):
+    for caption, columns_of in zip(captions, (ratios, work, heyoka), strict=True):
         rows = list(zip(*columns_of, strict=True))
         mean, least = means(rows)
         if any(mean):
@@ -203,9 +229,10 @@ def measure(make, which, saved, repeats, quick):
         later = problem.solution(ts)
         exact = jax.tree.map(lambda a, b: np.concatenate([a, b]), first, later)
     runs = all_runs(problem, quick, ts)
-    error = lambda y: relative_error(y, exact)
+    error = lambda found: relative_error(found[0], exact)
     enough = None if which == "seven" else (min(TARGETS), 1.0)
-    curves = error_curves(runs, error, repeats, enough)
+    cost = partial(evaluations, problem.t1, ts)
+    curves = error_curves(runs, error, repeats, enough, cost)
     return problem.name, curves, time.perf_counter() - start
 
 
@@ -215,6 +242,7 @@ def main():
     parser.add_argument("--output", type=pathlib.Path, default=FOLDER)
     parser.add_argument("--set", choices=SETS, default="seven")
     parser.add_argument("--saved", action="store_true", help="save at 201 times")
+    parser.add_argument("--raised", action="store_true", help="XLA's limit for loops")
     parser.add_argument("--only", nargs="+", help="parts of the names of problems")
     options = parser.parse_args()
     repeats = 1 if options.quick else options.repeats
@@ -225,6 +253,8 @@ def main():
         makers = list(filter(wanted, makers))
     results = {}
     print(f"{platform.processor() or platform.machine()}, median of {repeats} runs")
+    if options.raised:
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {RAISED}"
     # A process for each problem: compiled programs are kept until it ends.
     spawn = multiprocessing.get_context("spawn")
     for make in makers:
