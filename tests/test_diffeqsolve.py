@@ -23,7 +23,6 @@ from helpers import (
     step,
     WAYS,
 )
-from jaxtyping import Array
 
 import diffrax_presym as dps
 
@@ -220,14 +219,6 @@ def test_there_and_back(scheme: Scheme):
     assert_close(y_back, Y0, 1e-12)
 
 
-@each(WAYS)
-def test_backwards_the_past_is_found(scheme: Scheme, exact):
-    # Logarithmic damping is not defined before time 0, so the damping must be
-    # evaluated at the physical time, not at Diffrax's reversed time.
-    y_past, _ = go(scheme, 3.0, 1.0, exact(3.0))
-    assert_close(y_past, Y0, 10 * accuracy(scheme))
-
-
 def test_negative_times():
     # The same system with the time shifted by four.
     y, _ = go(SCHEMES[2], 1.0, 2.0, Y0)
@@ -284,49 +275,6 @@ def test_jumps_of_the_force(scheme: Scheme):
 
 
 # States of several structures
-
-
-class Body(eqx.Module):
-    place: Array
-    parts: dict
-
-
-def as_tree(x):
-    return {"body": Body(x[0], {"b": x[1:3].reshape(2, 1)}), "rest": (x[3:], None)}
-
-
-def tree_energy(t, q, args):
-    leaves = jtu.tree_leaves(q)
-    return sum(args * jnp.sum(1 - jnp.cos(x)) for x in leaves)
-
-
-def array_energy(t, q, args):
-    return args * jnp.sum(1 - jnp.cos(q))
-
-
-@pytest.mark.variants(1)
-@each(CARRIES)
-def test_states_are_any_pytrees(scheme: Scheme):
-    q, p = jnp.arange(1.0, 6.0) / 4, jnp.arange(5.0) / 5
-    damping = dps.ConstantDamping(0.3)
-
-    @eqx.filter_jit
-    def end(potential, y0):
-        hamiltonian = dps.ConformalHamiltonian(
-            dps.QuadraticKinetic(), potential, damping
-        )
-        term = hamiltonian
-        ts = jnp.array([0.3])
-        saveat = dfx.SaveAt(ts=ts, solver_state=True)
-        return dfx.diffeqsolve(
-            *(term, scheme.solver, 0.0, 0.5, 0.125, y0, ARGS), saveat=saveat
-        )
-
-    arrays = end(array_energy, (q, p)).ys
-    trees = end(tree_energy, (as_tree(q), as_tree(p))).ys
-    assert arrays is not None and trees is not None
-    expected = tuple(jax.vmap(as_tree)(x) for x in arrays)
-    assert_close(trees, expected, 1e-14)
 
 
 @pytest.mark.slow
@@ -478,7 +426,6 @@ def test_compositions_nest():
 # Implicit schemes
 
 MIXED = dps.ConformalHamiltonian(energy=mixed_energy, damping=dps.ConstantDamping(0.2))
-IMPLICIT_Y0 = (jnp.array([0.5, -0.3]), jnp.array([0.2, 0.4]))
 
 
 # Its implicit equations have no real solution for the state and step size below.

@@ -1,6 +1,5 @@
 """Single precision: no overflow and no promotion."""
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -198,16 +197,3 @@ def test_each_leaf_is_as_accurate_as_its_precision_allows():
     mixed, exact = run(MIXED), run(double)
     for x, y in zip(jtu.tree_leaves(mixed), jtu.tree_leaves(exact), strict=True):
         assert np.max(np.abs(x.astype(jnp.float64) - y)) < 20 * jnp.finfo(x.dtype).eps
-
-
-@pytest.mark.variants(1)
-@each([scheme for scheme in SCHEMES if scheme.name in ("leapfrog_AB", "tao_4")])
-def test_float32_agrees_with_float64(scheme: Scheme):
-    def run(dtype):
-        y0 = (jnp.array([1.0, 0.5], dtype), jnp.array([0.0, 0.5], dtype))
-        t0, t1, dt0 = (jnp.array(t, dtype) for t in (1.0, 3.0, 0.125))
-        saveat = dfx.SaveAt(ts=jnp.linspace(1.0, 3.0, 7).astype(dtype))
-        sol = solve(SYSTEMS["mixed"], scheme.solver, t0, t1, dt0, y0, saveat=saveat)
-        return np.asarray(sol.ys, np.float64)
-
-    np.testing.assert_allclose(run(jnp.float32), run(jnp.float64), atol=3e-6)

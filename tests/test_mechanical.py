@@ -116,25 +116,6 @@ def force_by_hand(name, t, q, v):
 
 
 @pytest.mark.parametrize("name", DRAGS)
-@pytest.mark.slow
-def test_order_with_drag(name):
-    slope = jax.jit(jax.grad(driven, argnums=1))
-
-    def rhs(t, y):
-        q, v = y[:3], y[3:] / 2
-        return np.concatenate([v, force_by_hand(name, t, q, v) - slope(t, q, None)])
-
-    start = np.concatenate(Y0)
-    options: Any = dict(rtol=3e-14, atol=1e-15)
-    end = scipy.integrate.solve_ivp(rhs, (0, 2), start, "DOP853", **options).y[:, -1]
-    steps = np.array([10, 14, 20])
-    ends = [solve(system(name), dps.BlanesMoan6(), 0.0, 2.0, 2 / n, Y0) for n in steps]
-    errors = [np.max(np.abs(flat(sol.ys) - end)) for sol in ends]
-    assert errors[-1] < 1e-6
-    assert abs(-np.polyfit(np.log(steps), np.log(errors), 1)[0] - 6) < 0.3
-
-
-@pytest.mark.parametrize("name", DRAGS)
 def test_friction_of_bodies(name):
     q, p = Y0
     found = system(name).friction_force(jnp.array(0.3), q, p)

@@ -1,27 +1,16 @@
 """Every scheme converges to the exact solution with the claimed order."""
 
-import functools
-
-import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
-import pytest
 import scipy.integrate
 import scipy.special
 from helpers import (
-    ANY,
-    each,
     few,
-    flat,
     harmonic,
-    IMPLICIT,
-    pendulum,
     reference,
     Scheme,
     SCHEMES,
-    solve,
     trajectory,
-    WAYS,
 )
 
 import diffrax_presym as dps
@@ -110,134 +99,3 @@ def test_order_on_oscillators(scheme: Scheme, case):
     error = lambda n: oscillator_error(case, scheme, 10 / (4 * n))
     order = measured_order(error, 10 * OSCILLATORS[case][-1])
     assert abs(order - scheme.order) < 0.15
-
-
-# Oscillators may super-converge, so the order is also measured on nonlinear systems.
-# The reference is from SciPy, for Hamilton's equations in the canonical momentum, with
-# hand-written derivatives.
-
-
-def driven_potential(t, q, args):
-    wave = 1 + jnp.cos(t) / 2
-    return wave * jnp.sum(1 - jnp.cos(q)) + q[0] ** 2 * q[1] / 2
-
-
-def driven_force(t, q):
-    wave = 1 + np.cos(t) / 2
-    return -wave * np.sin(q) - np.array([q[0] * q[1], q[0] ** 2 / 2])
-
-
-def driven_kinetic(t, p, args):
-    return (1 + jnp.sin(2 * t) / 3) * jnp.sqrt(1 + jnp.sum(p**2))
-
-
-def entangled(t, q, p, args):
-    return (1 + jnp.sum(q**2)) * (1 + jnp.sum(p**2)) * (1 + jnp.sin(t) / 4) / 2
-
-
-def wavy_damping(t):
-    return 0.1 * t + 0.2 * jnp.sin(t)
-
-
-def pendulum_field(t, q, P):
-    eta = 0.3 * t
-    return np.exp(-eta) * P, -np.exp(eta) * np.sin(q)
-
-
-def driven_quadratic_field(t, q, P):
-    eta2 = 0.1 * t + 0.2 * np.sin(t)
-    return P / (t + 2) / 1.5, np.exp(eta2) * driven_force(t, q)
-
-
-def driven_field(t, q, P):
-    scale = np.exp(0.2 * t)
-    p = P / scale
-    velocity = (1 + np.sin(2 * t) / 3) * p / np.sqrt(1 + p @ p)
-    return velocity, scale * driven_force(t, q)
-
-
-def entangled_field(t, q, P):
-    scale = t + 1
-    p, wave = P / scale, 1 + np.sin(t) / 4
-    return wave * (1 + q @ q) * p, -scale * wave * (1 + p @ p) * q
-
-
-# Hamiltonian, hand-written derivatives, eta(t)
-SYSTEMS = {
-    "damped pendulum": (
-        dps.ConformalHamiltonian(
-            dps.QuadraticKinetic(), pendulum, dps.ConstantDamping(0.3)
-        ),
-        pendulum_field,
-        lambda t: 0.3 * t,
-    ),
-    "driven, quadratic T": (
-        dps.DissipativeHamiltonian(
-            dps.QuadraticKinetic(1.5),
-            driven_potential,
-            eta1=dps.LogDamping(1.0, shift=2.0),
-            eta2=wavy_damping,
-        ),
-        driven_quadratic_field,
-        lambda t: 0.1 * t + 0.2 * np.sin(t),
-    ),
-    "driven": (
-        dps.ConformalHamiltonian(
-            driven_kinetic, driven_potential, dps.ConstantDamping(0.2)
-        ),
-        driven_field,
-        lambda t: 0.2 * t,
-    ),
-    "nonseparable": (
-        dps.ConformalHamiltonian(energy=entangled, damping=dps.LogDamping(1, shift=1)),
-        entangled_field,
-        lambda t: np.log(t + 1),
-    ),
-}
-T1 = 2.0
-Q0, P0 = np.array([1.0, 0.4]), np.array([0.2, -0.5])
-
-
-@functools.cache
-def truth(system):
-    _, field, eta = SYSTEMS[system]
-    sol = scipy.integrate.solve_ivp(
-        lambda t, y: np.concatenate(field(t, y[:2], y[2:])),
-        (0, T1),
-        np.concatenate([Q0, np.exp(eta(0)) * P0]),
-        method="DOP853",
-        rtol=3e-14,
-        atol=1e-15,
-    )
-    return np.concatenate([sol.y[:2, -1], np.exp(-eta(T1)) * sol.y[2:, -1]])
-
-
-def check_order(scheme: Scheme, system):
-    y0 = (jnp.array(Q0), jnp.array(P0))
-
-    def error(n):
-        hamiltonian = SYSTEMS[system][0]
-        sol = solve(hamiltonian, scheme.solver, 0.0, T1, T1 / n, y0, throw=False)
-        # The root finder fails for the largest steps.
-        solved = sol.result == dfx.RESULTS.successful
-        return np.max(np.abs(flat(sol.ys) - truth(system))) if solved else np.inf
-
-    order = measured_order(error, 2e-13)
-    assert abs(order - scheme.order) < 0.2
-
-
-@few(["driven, quadratic T", "damped pendulum"], WAYS)
-def test_order_on_quadratic_kinetic_energies(scheme: Scheme, case):
-    check_order(scheme, case)
-
-
-@pytest.mark.slow
-@each([scheme for scheme in WAYS if scheme.kind != "split"])
-def test_order_where_both_energies_depend_on_time(scheme: Scheme):
-    check_order(scheme, "driven")
-
-
-@pytest.mark.slow
-@each([*IMPLICIT, *(scheme for scheme in SCHEMES if scheme.kind in ANY)])
-def test_order_on_nonseparable_energies(scheme: Scheme):
-    check_order(scheme, "nonseparable")

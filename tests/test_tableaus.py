@@ -1,12 +1,10 @@
 # pyright: reportOptionalMemberAccess=false
 """The tabulated schemes: their coefficients, order, structure and cost."""
 
-import functools
 import json
 import math
 import pathlib
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -94,45 +92,6 @@ SYSTEMS = {
 }
 Y0 = (jnp.array([1.0, 0.5]), jnp.array([0.3, -0.7]))
 T0, T1 = 1.0, 5.0
-
-
-@functools.cache
-def exact(system):
-    sol = solve(SYSTEMS[system], dfx.Dopri8(), T0, T1, 1e-3, Y0)
-    return np.asarray(flat(sol.ys))
-
-
-@pytest.mark.parametrize("system", SYSTEMS)
-@pytest.mark.parametrize("name", NEW)
-def test_order_on_nonlinear_systems_that_depend_on_time(name, system):
-    solver = SCHEMES[name]
-    steps = np.array([4, 6, 8, 12, 16, 24, 32, 48, 64])
-    errors = []
-    for n in steps:
-        ys = flat(solve(SYSTEMS[system], solver, T0, T1, (T1 - T0) / n, Y0).ys)
-        errors.append(np.max(np.abs(np.asarray(ys) - exact(system))))
-    # Above rounding errors. A slope above the claimed order is pre-asymptotic.
-    fine = np.flatnonzero(np.array(errors) > 1e-13)[-3:]
-    slope, _ = np.polyfit(np.log(1 / steps[fine]), np.log(np.array(errors)[fine]), 1)
-    assert slope > solver.order(None) - 0.15
-
-
-def relativistic(t, q, args):
-    return jnp.sum(q**4) / 4
-
-
-@pytest.mark.parametrize("name", ["BlanesMoan4", "BlanesMoan6"])
-@pytest.mark.parametrize("damping", ["constant", "none"])
-def test_order_for_kinetic_energies_that_are_not_quadratic(name, damping):
-    eta = dps.ConstantDamping(0.3) if damping == "constant" else None
-    system = dps.ConformalHamiltonian(dps.RelativisticKinetic(), relativistic, eta)
-    expected = np.asarray(flat(solve(system, dfx.Dopri8(), 0.0, 4.0, 1e-3, Y0).ys))
-    errors = []
-    for h in (0.125, 0.0625):
-        ys = flat(solve(system, SPLITTINGS[name], 0.0, 4.0, h, Y0).ys)
-        errors.append(np.max(np.abs(np.asarray(ys) - expected)))
-    order = math.log2(errors[0] / errors[1])
-    assert abs(order - SPLITTINGS[name].order(None)) < 0.2
 
 
 @eqx.filter_jit

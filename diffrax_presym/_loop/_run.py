@@ -217,7 +217,7 @@ def _walk(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
     scheme, meter = problem.scheme, problem.progress_meter
     shared = problem.prepare(system)
 
-    def step(progress: Progress) -> Progress:
+    def one_step(progress: Progress) -> Progress:
         n, start = progress.n, progress.point
         span, infos = steps.span(system, n), progress.dense
         end, result = advance(scheme, system, span, start, shared)
@@ -228,7 +228,10 @@ def _walk(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
         return Progress(n + 1, end, result, meter.step(progress.meter, done), infos)
 
     start = Progress(jnp.asarray(0), problem.start, None, problem.meter, problem.dense)
-    can_fail = eqx.filter_eval_shape(step, start).result is not None
+    # Traced once, for all of its uses.
+    traced = eqx.filter_closure_convert(one_step, start)
+    can_fail = eqx.filter_eval_shape(traced, start).result is not None
+    step = lambda x: traced(eqx.tree_at(lambda x: x.result, x, None, is_leaf=_is_none))
     if can_fail:
         success = jtu.tree_map(jnp.asarray, dfx.RESULTS.successful)
         start = eqx.tree_at(lambda x: x.result, start, success, is_leaf=_is_none)

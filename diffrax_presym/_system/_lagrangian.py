@@ -199,6 +199,7 @@ class LagrangianSystem(AbstractSystem):
         return symmetric & all_finite((q, _solve_positive(M, p)))
 
 
+@jax.jit
 def _solve_positive(M: _Matrix, p: _Vector) -> _Vector:
     """The solution of `M v = p`, NaN if `M` is not positive definite.
 
