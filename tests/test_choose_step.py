@@ -10,6 +10,7 @@ import itertools
 from typing import Any
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -94,7 +95,7 @@ def test_the_tolerance_is_reached(name):
     assert step.order > solver.order(system) - 0.7
     assert step.on_grid == (name != "irregular")
     if step.on_grid and "ts" in options:
-        spacing = float(sol.ts[1] - sol.ts[0]) / step.dt0
+        spacing = float((sol.ts[1] - sol.ts[0]) / step.dt0)
         ratio = max(spacing, 1 / spacing)
         assert ratio == pytest.approx(round(ratio), rel=1e-12)
     assert f"{step.steps} steps" in str(step)
@@ -251,6 +252,19 @@ def test_bad_input(changes, message):
     given |= {"rtol": 1e-3, "atol": 1e-3} | changes
     with pytest.raises(ValueError, match=message):
         dps.choose_step(**given)
+
+
+@pytest.mark.parametrize("jit", [jax.jit, eqx.filter_jit])
+def test_the_solve_is_traced_once_for_the_choice_and_its_use(jit):
+    traced = []
+
+    @jit
+    def solve(dt0):
+        traced.append(dt0)
+        return solve_of(PENDULUM, RKN6, *LONG)(dt0)
+
+    solve(dps.choose_step(solve, 0.0, 20.0, rtol=1e-4, atol=1e-4).dt0)
+    assert len(traced) == 1
 
 
 def test_traced_input():

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import ArrayLike
+from jaxtyping import Array, ArrayLike, Float
 
 from ._convergence import doubling, find_steps, Solution, Trial
 from ._grid import intervals
@@ -17,7 +17,8 @@ class ChosenStep(NamedTuple):
 
     **Attributes:**
 
-    - `dt0`: the step, for the solve; negative if `t1 < t0`.
+    - `dt0`: the step, for the solve; negative if `t1 < t0`. An array, for which
+        neither `jax.jit` nor `equinox.filter_jit` compile the solve again.
     - `steps`: the number of steps that the solve takes.
     - `error`: the expected error, relative to the tolerance: at most 1.
     - `order`: the measured order, `nan` if errors are below rounding.
@@ -28,7 +29,7 @@ class ChosenStep(NamedTuple):
     - `trials`: the numbers of steps that were tried, and the errors found.
     """
 
-    dt0: float
+    dt0: Float[Array, ""]
     steps: int
     error: float
     order: float
@@ -56,7 +57,7 @@ class ChosenStep(NamedTuple):
 
 
 def choose_step(
-    solve: Callable[[float], Any],
+    solve: Callable[[Float[Array, ""]], Any],
     t0: ArrayLike,
     t1: ArrayLike,
     *,
@@ -112,7 +113,7 @@ def choose_step(
 
     **Arguments:**
 
-    - `solve`: a function of the step `dt0`, a number with the sign of `t1 - t0`, that
+    - `solve`: a function of the step `dt0`, a scalar with the sign of `t1 - t0`, that
         returns a `diffrax.Solution`. It should be jitted, and allow enough steps:
         `max_steps=None`.
     - `t0`, `t1`: the start and the end of the solve.
@@ -154,14 +155,15 @@ def choose_step(
             "`choose_step(max_steps=...)` must be a positive integer, but got "
             f"{max_steps!r}."
         )
-    run = lambda n: Solution.of(n, solve, (t1 - t0) / n)
+    length = lambda n: jax.device_put((t1 - t0) / n)
+    run = lambda n: Solution.of(n, solve, length(n))
     # Of a solve that fails, the saved times are not known.
     tried = map(run, takewhile(lambda n: n <= max_steps, doubling(4)))
     first = next((x for x in tried if x.finite), None)
     grid = None if first is None else intervals(first.ts, t0, t1)
     best, convergence = find_steps(run, tolerances, grid, max_steps)
     return ChosenStep(
-        dt0=(t1 - t0) / best.number,
+        dt0=length(best.number),
         steps=best.steps,
         error=best.error,
         order=convergence.order,

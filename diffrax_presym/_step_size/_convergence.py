@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import diffrax as dfx
 import jax
 import numpy as np
+from jaxtyping import Array
 
 
 # The error that is aimed at, and that with which the search ends, over the tolerance.
@@ -51,7 +52,7 @@ class Solution(NamedTuple):
     order: int | None  # of the scheme, if that is known
 
     @classmethod
-    def of(cls, number: int, solve: Callable[[float], Any], step) -> "Solution":
+    def of(cls, number: int, solve: Callable[[Array], Any], step) -> "Solution":
         try:
             with _quiet():
                 sol = jax.device_get(solve(step))
