@@ -38,7 +38,9 @@ class ChosenStep(NamedTuple):
     trials: tuple[Trial, ...]
 
     def __str__(self) -> str:
-        trials = ", ".join(f"{n} steps: {e:.1e}" for n, e in self.trials)
+        # A number of steps may have been tried twice.
+        tried = dict(self.trials).items()
+        trials = ", ".join(f"{n} steps: {e:.1e}" for n, e in tried)
         order = "below rounding" if math.isnan(self.order) else f"{self.order:.1f}"
         claim = self.claimed_order
         scheme = "" if claim is None else f", that of the scheme {claim}"
