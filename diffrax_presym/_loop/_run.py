@@ -142,17 +142,19 @@ class Progress(eqx.Module):
 class Track(eqx.Module):
     """Values at the starts of given steps, in order."""
 
-    stops: Int[Array, " rows"]
-    number: Int[Array, ""]  # of those that are due
+    # After those that are due a step that is never reached. The row that belongs to it
+    # takes what is not a value: to choose between rows would copy all of them.
+    stops: Int[Array, " rows+1"]
     value: Callable[[Array, Point], PyTree]  # of the row and the state there
     init: PyTree
+
+    def __init__(self, stops, is_due, never, value: Callable, init: PyTree):
+        self.stops = jnp.append(jnp.where(is_due, stops, never), never)
+        self.value, self.init = value, init
 
     def start(self) -> tuple[Array, PyTree]:
         stack = lambda x: jnp.broadcast_to(x, (len(self.stops), *jnp.shape(x)))
         return jnp.asarray(0), jtu.tree_map(stack, self.init)
-
-    def next_stop(self, j: Array, never: Array) -> Array:
-        return jnp.where(j < self.number, self.stops[j], never)
 
 
 class Trace(eqx.Module):
@@ -176,8 +178,8 @@ def run(problem: Problem, keep: Array | None = None):
     ]
     kept = None
     if keep is not None:
-        number = jnp.sum(keep <= last)
-        kept = Track(keep, number, lambda j, point: point, problem.start)
+        value = lambda j, point: point
+        kept = Track(keep, keep <= last, last + 1, value, problem.start)
     progress, (stacked, kept) = _walk(problem, (tracks, kept))
 
     saved, finite, starts = [], all_finite(progress.point[0]), []
@@ -202,13 +204,13 @@ def run(problem: Problem, keep: Array | None = None):
 
 def _track(problem: Problem, i: int) -> Track:
     rows, system, fns = problem.rows[i], problem.system, problem.fns
-    number = jnp.sum(rows.reached(problem.last))
+    stops = rows.stop, rows.reached(problem.last), problem.last + 1
     if problem.at_once:
-        return Track(rows.stop, number, lambda j, point: point, problem.start)
+        return Track(*stops, lambda j, point: point, problem.start)
     y = problem.start[0]
     init = fns[i](problem.steps.t0, y, system.args), jnp.asarray(True)
     value = lambda j, point: problem.output(i, (system, fns), j, point)
-    return Track(rows.stop, number, value, init)
+    return Track(*stops, value, init)
 
 
 def _walk(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
@@ -252,7 +254,7 @@ def _walk(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
     is_track = lambda x: isinstance(x, Track)
     flat, structure = jtu.tree_flatten(tracks, is_leaf=is_track)
     due = lambda states: [
-        track.next_stop(j, last + 1) for track, (j, _) in zip(flat, states, strict=True)
+        track.stops[j] for track, (j, _) in zip(flat, states, strict=True)
     ]
 
     def stop(x):
@@ -262,7 +264,8 @@ def _walk(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
         progress, new = advance_to(at, progress), []
         for track, (j, rows), next_stop in zip(flat, states, wanted, strict=True):
             here = next_stop == at
-            rows = _put(rows, j, track.value(j, progress.point), here)
+            place = jnp.where(here, j, len(track.stops) - 1)
+            rows = _put(rows, place, track.value(j, progress.point))
             new.append((jnp.where(here, j + 1, j), rows))
         return progress, new
 
@@ -272,7 +275,8 @@ def _walk(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
         return advance_to(last, start), jtu.tree_unflatten(structure, [])
     # The end is a stop too, so that there is one loop over steps.
     end, states = lax.while_loop(more, stop, (start, states))
-    return end, jtu.tree_unflatten(structure, [rows for _, rows in states])
+    values = [jtu.tree_map(lambda x: x[:-1], rows) for _, rows in states]
+    return end, jtu.tree_unflatten(structure, values)
 
 
 _is_none = lambda x: x is None
