@@ -1,7 +1,7 @@
 """The moves of schemes with one copy of the system.
 
-The state within a step is a pair: `(q, p)`, and the force of the last kick, or `None`
-if the scheme does not reuse it.
+The state within a step is a pair: `(q, p)`, and at the ends of a step the force there,
+if the scheme starts with a kick.
 """
 
 from collections.abc import Callable
@@ -52,7 +52,8 @@ class Drift(AbstractMove):
 class Kick(AbstractMove):
     """The flow of the other part of a split, at fixed time.
 
-    If `known`, the force is that of the last kick.
+    One that is `known` starts a step, by the force that the last step left. Its inverse
+    ends a step, and leaves the force.
     """
 
     kind: str = eqx.field(static=True)
@@ -66,13 +67,13 @@ class Kick(AbstractMove):
         if not self.known:
             return self.undo(system, span, data, stage)
         (y, force), split = stage, system.split(self.kind)
-        return (split.kick(system, span.t0, span.h, y, force, self.order), force), None
+        return (split.kick(system, span.t0, span.h, y, force, self.order), None), None
 
     def undo(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
         (y, carry), split = stage, system.split(self.kind)
         force = split.force(system, span.t0, y)
         y = split.kick(system, span.t0, span.h, y, force, self.order)
-        return (y, None if carry is None else force), None
+        return (y, force if self.known else carry), None
 
 
 # The moves of the paper, with forces and velocities frozen at one end. For nonseparable

@@ -8,7 +8,7 @@ from .._compositions import stages
 from .._system._bound import System
 from .._system._split import AbstractSplit
 from ._base import AbstractPresymplecticSolver, Scheme
-from ._engine import inverse, Stages
+from ._engine import inverse, Moves, Stages
 from ._moves import Drift, Enter, Kick
 from ._tableaus import (
     BLANES_CASAS_RKN_8,
@@ -48,15 +48,18 @@ class AbstractSplitting(AbstractPresymplecticSolver):
         drift, kick = Drift(kind, order), Kick(kind, order)
         drifts = stages(tableau.fractions[first::2])
         kicks = tableau.fractions[not first :: 2]
-        pairs = kicks[first:]
-        ends = drifts[: len(pairs), 1]
-        table = np.stack([ends, ends, pairs], axis=-1)
-        pair = Stages([drift, kick], np.stack([drifts[: len(pairs)], table], axis=1))
+        moves: list[Moves] = [drift]
+        spans = [tuple(drifts[-1])]
+        if len(drifts) > 1:
+            ends, inner = drifts[:-1, 1], kicks[first : first + len(drifts) - 1]
+            table = drifts[:-1], np.stack([ends, ends, inner], axis=-1)
+            moves.insert(0, Stages([drift, kick], np.stack(table, axis=1)))
+            spans.insert(0, (0, 1, 1))
         if first:
-            moves, spans = [Kick(kind, order, known=True), pair], [(0, 0, kicks[0])]
-            spans.append((0, 1, 1))
-        else:
-            moves, spans = [pair, drift], [(0, 1, 1), tuple(drifts[-1])]
+            # The force of the last kick is that of the first kick of the next step.
+            start = Kick(kind, order, known=True)
+            moves = [start, *moves, inverse(start)]
+            spans = [(0, 0, kicks[0]), *spans, (1, 1, kicks[-1])]
         if kind == "shared":
             enter = Enter()
             moves = [enter, *moves, inverse(enter)]
@@ -65,7 +68,6 @@ class AbstractSplitting(AbstractPresymplecticSolver):
             return Scheme(Stages(moves, spans))
         return Scheme(
             Stages(moves, spans),
-            # The force of the last kick is that of the first kick of the next step.
             start=lambda system, t, y: _first_force(system, kind, t, y),
             # Otherwise a kick is by a part of the force only.
             end_force=lambda carry: carry if "separable" in split.kinds else None,

@@ -71,16 +71,15 @@ class System(eqx.Module):
 
     def force(self, t: Time, y: State) -> PyTree:
         """The force on `p`, without linear friction."""
-        return _stored(self.term.force(t, *values(y), self.args), t)
+        return self.term.force(t, *values(y), self.args)
 
     def velocity_and_force(self, t: Time, y: State) -> State:
         """The vector field without linear friction."""
-        velocity, force = self.term.velocity_and_force(t, *values(y), self.args)
-        return velocity, _stored(force, t)
+        return self.term.velocity_and_force(t, *values(y), self.args)
 
     def potential_force(self, t: Time, y: State) -> PyTree:
         """The force of a kick, without that of the kinetic part."""
-        return _stored(self.term.potential_force(t, *values(y), self.args), t)
+        return self.term.potential_force(t, *values(y), self.args)
 
     def slope(self, t: Time, y: State, force: PyTree | None = None) -> State:
         """The full vector field, with friction. Reuses a given force."""
@@ -141,13 +140,6 @@ class System(eqx.Module):
         return self.term.drift_is_autonomous and (
             self.friction is None or self.friction.is_autonomous
         )
-
-
-def _stored(force: PyTree, t: Time) -> PyTree:
-    # A selection, which always gives the force, makes XLA store it. Otherwise XLA
-    # recomputes an elementwise force wherever it is used. At a time that is not a
-    # number neither is the force.
-    return jtu.tree_map(lambda f: jnp.where(t == t, f, jnp.nan), force)
 
 
 def bind(terms: PyTree, args: PyTree, y: State) -> System:
