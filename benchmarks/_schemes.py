@@ -33,12 +33,12 @@ SCHEMES = {
     "BlanesMoan4": Scheme(dps.BlanesMoan4(), 4, 6),
     "BlanesMoanRKN4": Scheme(dps.BlanesMoanRKN4(), 4, 6),
     "SuzukiYoshida(6)": Scheme(dps.SuzukiYoshida(6), 6, 9),
-    "SofroniouSpaletta6": Scheme(dps.SofroniouSpaletta6(), 6, 13),
+    "SofroniouSpaletta(6)": Scheme(dps.SofroniouSpaletta(6), 6, 13),
     "BlanesMoan6": Scheme(dps.BlanesMoan6(), 6, 10),
     "BlanesMoanRKN6": Scheme(dps.BlanesMoanRKN6(), 6, 14),
     "TunedRKN6": Scheme(dps.TunedRKN6(), 6, 14),
     "SuzukiYoshida(8)": Scheme(dps.SuzukiYoshida(8), 8, 27),
-    "SofroniouSpaletta8": Scheme(dps.SofroniouSpaletta8(), 8, 21),
+    "SofroniouSpaletta(8)": Scheme(dps.SofroniouSpaletta(8), 8, 21),
     "BlanesCasasRKN8": Scheme(dps.BlanesCasasRKN8(), 8, 19),
     # Of order 8 for an oscillator, and 4 for other forces.
     "TunedLinear8": Scheme(dps.TunedLinear8(), 4, 14),
@@ -46,11 +46,8 @@ SCHEMES = {
     "SymmetricMultistep(8)": Scheme(dps.SymmetricMultistep(8), 8, 1),
     "SymmetricMultistep(10)": Scheme(dps.SymmetricMultistep(10), 10, 1),
     "SymmetricMultistep(12)": Scheme(dps.SymmetricMultistep(12), 12, 1),
-    "SofroniouSpaletta10": Scheme(dps.SofroniouSpaletta10(), 10, 35),
+    "SofroniouSpaletta(10)": Scheme(dps.SofroniouSpaletta(10), 10, 35),
     "PresymplecticTao": Scheme(dps.PresymplecticTao(), 2, 3),
-    "PresymplecticCoupled(2)": Scheme(dps.PresymplecticCoupled(2), 2, 3),
-    "PresymplecticCoupled(4)": Scheme(dps.PresymplecticCoupled(4), 4, 11),
-    "PresymplecticCoupled(6)": Scheme(dps.PresymplecticCoupled(6), 6, 27),
     # Six stages at once, in each of several iterations.
     "PresymplecticGauss(6)": Scheme(dps.PresymplecticGauss(6), 12, 40),
 }

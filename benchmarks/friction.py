@@ -28,12 +28,12 @@ import diffrax_presym as dps
 
 TARGETS = (1e-3, 1e-6, 1e-9)
 # For friction by place or by speed, and for any linear friction.
-GENERAL = "Strang", "BlanesMoan4", "BlanesMoan6", "SofroniouSpaletta8, Strang"
+GENERAL = "Strang", "BlanesMoan4", "BlanesMoan6", "SofroniouSpaletta(8), Strang"
 NYSTROM = "PresymplecticLeapfrog", "BlanesMoanRKN4", "TunedRKN6", "BlanesCasasRKN8"
-STRANG_8 = SCHEMES["SofroniouSpaletta8"]._replace(
-    solver=dps.SofroniouSpaletta8(dps.Strang())
+STRANG_8 = SCHEMES["SofroniouSpaletta(8)"]._replace(
+    solver=dps.SofroniouSpaletta(8, dps.Strang())
 )
-OURS = SCHEMES | {"SofroniouSpaletta8, Strang": STRANG_8}
+OURS = SCHEMES | {"SofroniouSpaletta(8), Strang": STRANG_8}
 
 
 class System(NamedTuple):
@@ -69,7 +69,7 @@ def network():
     def potential(t, q, args):
         return q @ (stiffness @ q) / 2 + jnp.sum(q**4) / 4
 
-    friction = dps.RayleighDamping(0.05, 0.02, stiffness)
+    friction = [dps.ConstantDamping(0.05), dps.ViscousDamping(0.02 * stiffness)]
     masses = jnp.asarray(rng.uniform(0.5, 2, n))
     system = mechanics(potential, friction, dps.QuadraticKinetic(masses))
     y0 = jnp.asarray(rng.normal(size=n)), jnp.zeros(n)
@@ -181,7 +181,7 @@ def work(problem, quick):
 
 _SHORT = {
     "PresymplecticLeapfrog": "Leapfrog",
-    "SofroniouSpaletta8, Strang": "SS8",
+    "SofroniouSpaletta(8), Strang": "SS8",
     "BlanesMoanRKN4": "RKN4",
     "TunedRKN6": "RKN6",
     "BlanesCasasRKN8": "RKN8",

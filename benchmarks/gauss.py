@@ -2,9 +2,9 @@
 
 Linkages with friction in each joint, a charged particle, geodesics on an ellipsoid and
 around a black hole, a relativistic particle in a field, and Tao's benchmark, with
-`PresymplecticGauss`, `PresymplecticCoupled`, and Diffrax's `Tsit5`, `Dopri5`, `Dopri8`
-and `Kvaerno5`, adaptive and with constant steps. A dash is an error that no run
-reached. `--only chain` measures the problems whose names begin so.
+`PresymplecticGauss`, and Diffrax's `Tsit5`, `Dopri5`, `Dopri8` and `Kvaerno5`, adaptive
+and with constant steps. A dash is an error that no run reached. `--only chain` measures
+the problems whose names begin so.
 
 `--mujoco` compares chains of 3 and of 10 hinges, with a damper in each, with MuJoCo,
 and their mass matrices. `--long` follows the energy of an undamped double pendulum over
@@ -124,7 +124,6 @@ FIXED |= {
     f"Gauss({s}), {tol:.0e}": dps.PresymplecticGauss(s, tolerance=tol)
     for s, tol in ((2, 1e-5), (4, 1e-5), (4, 1e-8), (6, 1e-8), (6, 1e-11), (8, 1e-11))
 }
-FIXED |= {f"Coupled({n})": dps.PresymplecticCoupled(n) for n in (4, 6)}
 THEIRS = {name: scheme.solver for name, scheme in DIFFRAX.items()} | {
     "Kvaerno5": dfx.Kvaerno5()
 }
@@ -154,7 +153,7 @@ def curves(system, times, y0, exact, longest, quick):
 
 
 def compare(options):
-    ratios = {rival: [] for rival in ("Diffrax", "Coupled")}
+    ratios = {"Diffrax": []}
     for problem, (make, longest) in PROBLEMS.items():
         if options.only and not problem.startswith(tuple(options.only)):
             continue

@@ -32,7 +32,7 @@ CANDIDATES = ("TunedRKN6", "BlanesCasasRKN8", "BlanesMoanRKN6", "SymmetricMultis
 def force_loop(problem, stages):
     """As many force evaluations as a solve of `n` steps has, each from the last."""
     system = problem.system
-    force = lambda t, q: system.potential_force(t, q, None)
+    force = lambda t, q: system.potential.force(t, q)
     if not isinstance(system.kinetic, dps.QuadraticKinetic):
         # The roles are swapped, and the kicks are by the velocity.
         force = lambda t, q: system.velocity(t, None, q)

@@ -38,9 +38,6 @@ QUADRATIC = {"BlanesMoanRKN6": SCHEMES["BlanesMoanRKN6"]}
 COPIES = {
     "Tao": SCHEMES["PresymplecticTao"],
     "Suzuki4 of Tao": Scheme(dps.Suzuki4(dps.PresymplecticTao(20.0)), 4, 15),
-    "Coupled, 2": SCHEMES["PresymplecticCoupled(2)"],
-    "Coupled, 4": SCHEMES["PresymplecticCoupled(4)"],
-    "Coupled, 6": SCHEMES["PresymplecticCoupled(6)"],
 }
 MIDPOINT = dps.PresymplecticGauss(1, NEWTON)
 IMPLICIT = {
@@ -133,11 +130,11 @@ def energies(solver, h, t1, max_steps):
 TAO = dps.PresymplecticTao
 LONG = {
     "Tao": SCHEMES["PresymplecticTao"],
-    "Coupled": SCHEMES["PresymplecticCoupled(2)"],
     "Suzuki4 of Tao, 10": Scheme(dps.Suzuki4(TAO(10.0)), 4, 15),
     "Suzuki4 of Tao, 20": Scheme(dps.Suzuki4(TAO(20.0)), 4, 15),
-    "Coupled, 4": SCHEMES["PresymplecticCoupled(4)"],
-    "Coupled, 6": SCHEMES["PresymplecticCoupled(6)"],
+    # About so many evaluations, in its iterations.
+    "Gauss, 1 stage": Scheme(dps.PresymplecticGauss(1), 2, 10),
+    "Gauss, 2 stages": Scheme(dps.PresymplecticGauss(2), 4, 20),
 }
 
 
@@ -165,16 +162,13 @@ def long_times(quick):
 
 
 def scan(quick):
-    """Energy errors over strength and step, for Tao's scheme at orders 2 and 4 and for
-    the angle of `PresymplecticCoupled`."""
+    """Energy errors over strength and step, for Tao's scheme at orders 2 and 4."""
     t1, many = (20.0, 24) if quick else (100.0, 72)
     hs = np.geomspace(0.01, 0.2, many)
-    strengths, angles = np.geomspace(0.1, 300, 2 * many), np.linspace(0, 6.5, 2 * many)
+    strengths = np.geomspace(0.1, 300, 2 * many)
     makers = {
         "Tao, order 2": (TAO, strengths),
         "Suzuki4 of Tao": (lambda x: dps.Suzuki4(TAO(x)), strengths),
-        "Coupled, order 2": (lambda x: dps.PresymplecticCoupled(2, x), angles),
-        "Coupled, order 4": (lambda x: dps.PresymplecticCoupled(4, x), angles),
     }
     found = {}
     for name, (make, values) in makers.items():
@@ -196,8 +190,8 @@ def picture_speed(curves, path):
 
 
 def picture_long(t1, curves, path):
-    fig, axes = panels(3, 3, (4.4, 4), sharey=True)
-    for ax, order in zip(axes, (2, 4, 6), strict=True):
+    fig, axes = panels(2, 2, (4.4, 4), sharey=True)
+    for ax, order in zip(axes, (2, 4), strict=True):
         for name, (r, errors) in curves.items():
             if r == order:
                 style = ":" if "Tao" in name else "-"
@@ -210,25 +204,19 @@ def picture_long(t1, curves, path):
 
 
 def picture_scan(found, path):
-    fig, axes = panels(4, 4, (4, 4.5), sharey=True)
+    fig, axes = panels(2, 2, (4, 4.5), sharey=True)
     for ax, (name, (hs, values, errors)) in zip(axes, found.items(), strict=True):
         shown = np.log10(np.clip(np.nan_to_num(errors, nan=1e2), 1e-8, 1e2))
         ax.pcolormesh(
             values, hs, shown, vmin=-6, vmax=1, cmap="viridis", rasterized=True
         )
         ax.set(yscale="log", title=name, ylim=(hs[0], hs[-1]))
-        if "Tao" in name:
-            ax.set(xscale="log", xlabel=r"coupling $\xi$")
-            for k in (1, 2, 3):
-                ax.plot(k * np.pi / 2 / hs, hs, "w:", lw=1)
-            if "order" in name:
-                ax.plot(3 * np.pi / 16 / hs, hs, "r--", lw=1.5)
-            ax.set_xlim(values[0], values[-1])
-        else:
-            ax.set(xlabel="angle (radians)")
-            for k in (1, 2):
-                ax.axvline(k * np.pi, color="w", ls=":", lw=1)
-            ax.axvline(np.pi / 2, color="r", ls="--", lw=1.5)
+        ax.set(xscale="log", xlabel=r"coupling $\xi$")
+        for k in (1, 2, 3):
+            ax.plot(k * np.pi / 2 / hs, hs, "w:", lw=1)
+        if "order" in name:
+            ax.plot(3 * np.pi / 16 / hs, hs, "r--", lw=1.5)
+        ax.set_xlim(values[0], values[-1])
     axes[0].set_ylabel("step $h$")
     label = "log10 of the largest error of the energy"
     fig.colorbar(axes[0].collections[0], ax=axes, label=label)

@@ -27,9 +27,9 @@ NAMES = (
     "PresymplecticYoshida4",
     "PresymplecticYoshida4, position first",
     *("Suzuki4", "BlanesMoan4", "BlanesMoanRKN4"),
-    *("SuzukiYoshida(6)", "SofroniouSpaletta6"),
+    *("SuzukiYoshida(6)", "SofroniouSpaletta(6)"),
     *("BlanesMoan6", "BlanesMoanRKN6", "TunedRKN6"),
-    *("SuzukiYoshida(8)", "SofroniouSpaletta8", "BlanesCasasRKN8"),
+    *("SuzukiYoshida(8)", "SofroniouSpaletta(8)", "BlanesCasasRKN8"),
 )
 PROBLEMS = {
     "pendulum": problems.pendulum,

@@ -7,7 +7,6 @@ from ._friction import (
     LogDamping as LogDamping,
     PositionDamping as PositionDamping,
     PowerDamping as PowerDamping,
-    RayleighDamping as RayleighDamping,
     ViscousDamping as ViscousDamping,
 )
 from ._loop import (
@@ -22,15 +21,12 @@ from ._scheme import (
     BlanesMoanRKN6 as BlanesMoanRKN6,
     Compensated as Compensated,
     Composition as Composition,
-    PresymplecticCoupled as PresymplecticCoupled,
     PresymplecticEuler as PresymplecticEuler,
     PresymplecticGauss as PresymplecticGauss,
     PresymplecticLeapfrog as PresymplecticLeapfrog,
     PresymplecticTao as PresymplecticTao,
     PresymplecticYoshida4 as PresymplecticYoshida4,
-    SofroniouSpaletta6 as SofroniouSpaletta6,
-    SofroniouSpaletta8 as SofroniouSpaletta8,
-    SofroniouSpaletta10 as SofroniouSpaletta10,
+    SofroniouSpaletta as SofroniouSpaletta,
     Splitting as Splitting,
     SplittingTableau as SplittingTableau,
     Strang as Strang,
@@ -42,10 +38,8 @@ from ._scheme import (
     TunedRKN6 as TunedRKN6,
 )
 from ._step_size import (
-    ArclengthDensity as ArclengthDensity,
     choose_step as choose_step,
     ChosenStep as ChosenStep,
-    DistanceDensity as DistanceDensity,
     StepDensityController as StepDensityController,
 )
 from ._system import (

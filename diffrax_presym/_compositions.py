@@ -5,19 +5,11 @@ digits are kept, more than a float holds.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ._misc import cast_to
-
-
-class CompositionTableau(NamedTuple):
-    """The lengths of the stages of a composition, in units of the step."""
-
-    order: int
-    weights: tuple[float, ...]
 
 
 def mirror(*half: float) -> tuple[float, ...]:
@@ -26,19 +18,15 @@ def mirror(*half: float) -> tuple[float, ...]:
 
 
 # M. Suzuki (1990), Physics Letters A 146, 319: w = 1 / (4 - 4^(1/3)).
-SUZUKI_4 = CompositionTableau(
-    order=4,
-    weights=mirror(
-        0.414490771794375737142354062860761495711774604,
-        0.414490771794375737142354062860761495711774604,
-        -0.657963087177502948569416251443045982847098416,
-    ),
+SUZUKI_4 = mirror(
+    0.414490771794375737142354062860761495711774604,
+    0.414490771794375737142354062860761495711774604,
+    -0.657963087177502948569416251443045982847098416,
 )
 
-# M. Sofroniou and G. Spaletta (2005), Optim. Methods Softw. 20, 597, 13 stages.
-SOFRONIOU_SPALETTA_6 = CompositionTableau(
-    order=6,
-    weights=mirror(
+# M. Sofroniou and G. Spaletta (2005), Optim. Methods Softw. 20, 597, by order.
+SOFRONIOU_SPALETTA = {
+    6: mirror(
         0.138619308540516952458080130426253537644818248,
         0.133465628510747604070468588322092559649753689,
         0.130705310114492251905427557850152043401431775,
@@ -47,12 +35,7 @@ SOFRONIOU_SPALETTA_6 = CompositionTableau(
         0.118055306530023871702734389540489755365728649,
         0.399077515348715874599887955206651735676018395,
     ),
-)
-
-# M. Sofroniou and G. Spaletta (2005), 21 stages.
-SOFRONIOU_SPALETTA_8 = CompositionTableau(
-    order=8,
-    weights=mirror(
+    8: mirror(
         0.106477289845500318239319678548958514957780294,
         0.108374086458357263974334105915459220955800994,
         0.353378210526543424195345413240799339843809432,
@@ -65,12 +48,7 @@ SOFRONIOU_SPALETTA_8 = CompositionTableau(
         0.116991350192176421807228814335329066991943872,
         -0.382635960126436653509446707440395706982802697,
     ),
-)
-
-# M. Sofroniou and G. Spaletta (2005), 35 stages.
-SOFRONIOU_SPALETTA_10 = CompositionTableau(
-    order=10,
-    weights=mirror(
+    10: mirror(
         0.0787957225216864192639076793376842482198638728,
         0.313096103415108527764812471926472696881054022,
         0.0279183832350780661095202732752988231186749257,
@@ -90,10 +68,7 @@ SOFRONIOU_SPALETTA_10 = CompositionTableau(
         0.0496743706397298790545688002794611763445541576,
         0.0493177357595945379176800083393381476498470148,
     ),
-)
-
-
-_KNOWN = SUZUKI_4, SOFRONIOU_SPALETTA_6, SOFRONIOU_SPALETTA_8, SOFRONIOU_SPALETTA_10
+}
 
 
 def stages(weights: Sequence[float]) -> np.ndarray:
@@ -104,11 +79,9 @@ def stages(weights: Sequence[float]) -> np.ndarray:
     return np.stack([starts, ends, weights], axis=-1)
 
 
-def spans(order: int, h: ArrayLike) -> tuple[Array, Array]:
-    """Starts and lengths of the stages of a composition of symmetric maps of order two,
-    of at least the given order, or the highest known."""
-    weights = (1.0,)
-    if order > 2:
-        weights = next((x for x in _KNOWN if x.order >= order), _KNOWN[-1]).weights
-    starts, _, lengths = stages(weights).T
-    return cast_to(starts, h) * h, cast_to(lengths, h) * h
+def lengths(order: int, h: ArrayLike) -> Array:
+    """The lengths of the stages of a composition of symmetric maps of order two, of at
+    least the given order, or the highest known."""
+    known = {2: (1.0,), 4: SUZUKI_4} | SOFRONIOU_SPALETTA
+    weights = next((x for r, x in known.items() if r >= order), known[10])
+    return cast_to(np.array(weights), h) * h

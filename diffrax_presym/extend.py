@@ -1,7 +1,7 @@
 """What one needs to write systems, friction and schemes of one's own."""
 
 from ._friction._base import AbstractFriction as AbstractFriction
-from ._friction._damping import AbstractDamping as AbstractDamping
+from ._friction._damping import Damping as Damping
 from ._friction._log_scale import AbstractLogScale as AbstractLogScale
 from ._interpolation import HermiteInterpolation as HermiteInterpolation
 from ._scheme._base import (
@@ -14,7 +14,6 @@ from ._scheme._engine import (
     Stages as Stages,
 )
 from ._system._base import (
-    AbstractKineticSystem as AbstractKineticSystem,
     AbstractSystem as AbstractSystem,
 )
 from ._system._bound import System as System
@@ -22,9 +21,4 @@ from ._system._kinetic import AbstractKinetic as AbstractKinetic
 from ._system._mirror import AbstractMirrorMap as AbstractMirrorMap
 from ._system._potential import AbstractPotential as AbstractPotential
 from ._system._scaling import AbstractScaling as AbstractScaling
-from ._system._split import (
-    AbstractSplit as AbstractSplit,
-    KineticSplit as KineticSplit,
-    PotentialSplit as PotentialSplit,
-    SharedSplit as SharedSplit,
-)
+from ._system._split import AbstractSplit as AbstractSplit

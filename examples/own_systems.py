@@ -1,3 +1,4 @@
+# pyright: reportCallIssue=false
 """A manifold, a drift and a constraint of one's own, as a user writes them.
 
 A damped spherical pendulum whose drift is the geodesic flow of the sphere; a perturbed
@@ -8,7 +9,7 @@ of the constraint and that of the gradient by reversal, beside central differenc
 """
 
 import argparse
-from typing import Any
+from typing import ClassVar
 
 import diffrax as dfx
 import jax
@@ -18,10 +19,10 @@ import scipy.integrate
 
 import diffrax_presym as dps
 from diffrax_presym.extend import (
-    AbstractKineticSystem,
     AbstractMove,
     AbstractPresymplecticSolver,
-    KineticSplit,
+    AbstractSplit,
+    AbstractSystem,
     Scheme,
 )
 
@@ -29,18 +30,43 @@ from diffrax_presym.extend import (
 jax.config.update("jax_enable_x64", True)
 
 
-class Sphere(AbstractKineticSystem):
+def tangential_gravity(q):
+    gravity = jnp.array([0.0, 0.0, -1.0])
+    return gravity - (gravity @ q) * q
+
+
+class GeodesicDrift(AbstractSplit):
+    """Great circles, with the friction, and kicks by the tangential force."""
+
+    kinds: ClassVar = frozenset({"any"})
+
+    def prepare(self, system, t, h, order):
+        return system.friction.prepare(t, h, order)  # type: ignore
+
+    def drift(self, system, t, h, data, y):
+        q, p = y
+        change, carried = system.friction.flow(data, p)  # type: ignore
+        speed = jnp.linalg.norm(p)
+        angle, left = carried @ p / speed, 1 + change @ p / speed**2
+        c, s = jnp.cos(angle), jnp.sin(angle)
+        return c * q + s * p / speed, left * (c * p - s * speed * q)
+
+    def force(self, system, t, y):
+        return tangential_gravity(y[0])
+
+
+class Sphere(AbstractSystem):
     """A particle on the unit sphere with gravity and friction; the drift is exact."""
 
     gamma: jax.Array
 
     @property
     def splits(self):
-        return (KineticSplit(separable=False, nystrom=False),)
+        return (GeodesicDrift(),)
 
     @property
-    def parts(self):
-        return dps.ConstantDamping(self.gamma).parts(self.mechanics)
+    def laws(self):
+        return (dps.ConstantDamping(self.gamma),)
 
     def energy(self, t, q, p, args=None):
         return p @ p / 2 + q[2]
@@ -48,32 +74,41 @@ class Sphere(AbstractKineticSystem):
     def velocity(self, t, q, p, args=None):
         return p
 
-    def potential_force(self, t, q, p, args=None):
-        gravity = jnp.array([0.0, 0.0, -1.0])
-        return gravity - (gravity @ q) * q
-
     def force(self, t, q, p, args=None):
-        return self.potential_force(t, q, p) - (p @ p) * q
-
-    def prepare_drift(self, friction: Any, t, h, order):
-        return friction.prepare(t, h, order)
-
-    def drift(self, friction: Any, t, h, data, q, p, args):
-        change, carried = friction.flow(data, p)
-        speed = jnp.linalg.norm(p)
-        angle, left = carried @ p / speed, 1 + change @ p / speed**2
-        c, s = jnp.cos(angle), jnp.sin(angle)
-        return (c - 1) * q + s * p / speed, left * (c * p - s * speed * q) - p
+        return tangential_gravity(q) - (p @ p) * q
 
 
-class Orbit(AbstractKineticSystem):
+class KeplerDrift(AbstractSplit):
+    """The exact Kepler orbit, and kicks by the perturbation."""
+
+    kinds: ClassVar = frozenset({"any"})
+
+    def drift(self, system, t, h, data, y):
+        # By the difference x of the eccentric anomaly, from Kepler's equation.
+        (q, p), r = y, jnp.linalg.norm(y[0])
+        a = 1 / (2 / r - p @ p)
+        n, e, d = a**-1.5, 1 - r / a, q @ p / jnp.sqrt(a)
+        x = n * h
+        for _ in range(8):
+            excess = x - e * jnp.sin(x) + d * (1 - jnp.cos(x)) - n * h
+            x = x - excess / (1 - e * jnp.cos(x) + d * jnp.sin(x))
+        c, s = jnp.cos(x), jnp.sin(x)
+        end = a * (1 - e * c + d * s)
+        dq = -a / r * (1 - c) * q + (h + (s - x) / n) * p
+        return q + dq, p - jnp.sqrt(a) * s / (end * r) * q - a / end * (1 - c) * p
+
+    def force(self, system, t, y):
+        return -jax.grad(system.term.potential)(y[0])
+
+
+class Orbit(AbstractSystem):
     """A satellite of an oblate body; the drift is the exact Kepler orbit."""
 
     oblateness: jax.Array
 
     @property
     def splits(self):
-        return (KineticSplit(separable=False, nystrom=False),)
+        return (KeplerDrift(),)
 
     def potential(self, q):
         r = jnp.linalg.norm(q)
@@ -85,28 +120,8 @@ class Orbit(AbstractKineticSystem):
     def velocity(self, t, q, p, args=None):
         return p
 
-    def potential_force(self, t, q, p, args=None):
-        return -jax.grad(self.potential)(q)
-
     def force(self, t, q, p, args=None):
-        return self.potential_force(t, q, p) - q / jnp.linalg.norm(q) ** 3
-
-    def prepare_drift(self, friction, t, h, order):
-        return None
-
-    def drift(self, friction, t, h, data, q, p, args):
-        # By the difference x of the eccentric anomaly, from Kepler's equation.
-        r, u = jnp.linalg.norm(q), q @ p
-        a = 1 / (2 / r - p @ p)
-        n, e, d = a**-1.5, 1 - r / a, u / jnp.sqrt(a)
-        x = n * h
-        for _ in range(8):
-            excess = x - e * jnp.sin(x) + d * (1 - jnp.cos(x)) - n * h
-            x = x - excess / (1 - e * jnp.cos(x) + d * jnp.sin(x))
-        c, s = jnp.cos(x), jnp.sin(x)
-        end = a * (1 - e * c + d * s)
-        dq = -a / r * (1 - c) * q + (h + (s - x) / n) * p
-        return dq, -jnp.sqrt(a) * s / (end * r) * q - a / end * (1 - c) * p
+        return -jax.grad(self.potential)(q) - q / jnp.linalg.norm(q) ** 3
 
 
 class RattleMove(AbstractMove):

@@ -49,7 +49,6 @@ class System:
     # The friction that it takes: "all", "rates", "joints", "one rate" or "none".
     takes: str
     mass: Any = None
-    stiffness: Any = None
     bodies: bool = False  # whether the last axis are the coordinates of bodies
     linear: bool = False
     start: float = START
@@ -317,7 +316,7 @@ SYSTEMS = [
     ),
     System(
         *("linear", _mechanical(_quadratic(_MASS), dps.QuadraticPotential(_SPRINGS))),
-        *(_inverse(_MASS), _spring_force, *_TWO, ALL, "all", _MASS, _SPRINGS),
+        *(_inverse(_MASS), _spring_force, *_TWO, ALL, "all", _MASS),
         linear=True,
     ),
     System(
@@ -332,7 +331,6 @@ SYSTEMS = [
         "any T, springs",
         _mechanical(_smooth_kinetic, dps.QuadraticPotential(_SPRINGS)),
         *(_smooth_velocity, _spring_force, *_TWO, SWAPPED, "rates"),
-        stiffness=_SPRINGS,
     ),
     System(
         *("any energy", _energy(_mixed), _mixed_velocity, _mixed_force),
@@ -387,7 +385,7 @@ class Friction:
     kind: str  # "none", "one rate", "entries", "matrix", "place", "drag" or "force"
     eta: Callable = lambda t: 0.0
     external: Callable | None = None
-    needs: str = ""  # "mass", "stiffness" or "bodies"
+    needs: str = ""  # "mass" or "bodies"
     double: bool = False  # whether it is made for double precision
     constant: bool = True  # in time
     smooth: bool = True  # whether its rate has a derivative that is known
@@ -408,10 +406,6 @@ def _rates(system):
 def _shaped(system, numbers):
     """Numbers for the entries of a state as the package takes them."""
     return jax.tree.map(jnp.asarray, ravel_pytree(system.q)[1](jnp.asarray(numbers)))
-
-
-def _over_mass(system):
-    return np.diag(4 + _rates(system)) @ np.linalg.inv(system.mass)
 
 
 def _matrix(system, skew=False):
@@ -525,8 +519,13 @@ def _sum(*forces):
     return lambda *x: sum(force(*x) for force in forces)
 
 
-def _viscous(system, law=None, skew=False):
-    return dps.ViscousDamping(_as_forms(system, _matrix(system, skew)), law)
+def _rayleigh(system):
+    springs = _as_forms(system, 0.3 * _matrix(system))
+    return [dps.ConstantDamping(0.2), dps.ViscousDamping(springs)]
+
+
+def _viscous(system, skew=False):
+    return dps.ViscousDamping(_as_forms(system, _matrix(system, skew)))
 
 
 def _from_rest(name, law, gamma, extra=0.0):
@@ -605,41 +604,9 @@ FRICTION = [
         needs="mass",
     ),
     Friction(
-        "matrix, in time",
-        _some(lambda s: [_viscous(s, dps.LogDamping(2.0, 1.0))]),
-        *(lambda s, t, q, p, v: -2 / (t + 1) * _matrix(s) @ v, "matrix"),
+        *("Rayleigh", _some(_rayleigh)),
+        *(lambda s, t, q, p, v: -0.2 * p - 0.3 * _matrix(s) @ v, "matrix"),
         needs="mass",
-        constant=False,
-    ),
-    Friction(
-        "dashpots / t",
-        _some(
-            lambda s: [
-                dps.ViscousDamping(_shaped(s, 4 + _rates(s)), dps.LogDamping(1.0))
-            ]
-        ),
-        *(lambda s, t, q, p, v: -(4 + _rates(s)) / t * v, "entries"),
-        needs="mass",
-        constant=False,
-        # One more than the smallest rate times `t`.
-        left=lambda s: int(1 + np.min(np.linalg.eigvals(_over_mass(s)).real)),
-        limit=lambda s, force: np.linalg.solve(np.eye(s.size) + _over_mass(s), force),
-    ),
-    Friction(
-        "matrix / t",
-        _some(lambda s: [_viscous(s, dps.LogDamping(4.0))]),
-        *(lambda s, t, q, p, v: -4 / t * _matrix(s) @ v, "matrix"),
-        needs="mass",
-        constant=False,
-        left=lambda s: 2,
-        limit=lambda s, force: np.linalg.solve(
-            np.eye(s.size) + 4 * _matrix(s) @ np.linalg.inv(s.mass), force
-        ),
-    ),
-    Friction(
-        *("Rayleigh", _some(lambda s: [dps.RayleighDamping(0.2, 0.3)])),
-        *(lambda s, t, q, p, v: -0.2 * p - 0.3 * s.stiffness @ v, "matrix"),
-        needs="stiffness",
     ),
     Friction(
         "operator",
@@ -768,9 +735,11 @@ SCHEMES = [
         inside=False,
     ),
     Scheme("Suzuki4", dps.Suzuki4, 4, "separable"),
-    Scheme("Sofroniou-Spaletta 6", dps.SofroniouSpaletta6, 6, "separable"),
-    Scheme("Sofroniou-Spaletta 8", dps.SofroniouSpaletta8, 8, "separable"),
-    Scheme("Sofroniou-Spaletta 10", dps.SofroniouSpaletta10, 10, "separable"),
+    Scheme(*("Sofroniou-Spaletta 6", lambda: dps.SofroniouSpaletta(6), 6, "separable")),
+    Scheme(*("Sofroniou-Spaletta 8", lambda: dps.SofroniouSpaletta(8), 8, "separable")),
+    Scheme(
+        *("Sofroniou-Spaletta 10", lambda: dps.SofroniouSpaletta(10), 10, "separable")
+    ),
     Scheme("Strang", dps.Strang, 2, "any"),
     Scheme("Blanes-Moan 4", dps.BlanesMoan4, 4, "any"),
     Scheme("Blanes-Moan 6", dps.BlanesMoan6, 6, "any"),
@@ -795,14 +764,6 @@ SCHEMES = [
         composable=False,
     ),
     Scheme("Tao 4", _tao4, 4, None, inside=False),
-    Scheme(
-        *("coupled 2", dps.PresymplecticCoupled, 2, None),
-        composable=False,
-    ),
-    Scheme(
-        *("coupled 6", lambda: dps.PresymplecticCoupled(6), 6, None),
-        composable=False,
-    ),
     Scheme(
         "midpoint", lambda find: dps.PresymplecticGauss(1, find), 2, None, implicit=True
     ),
@@ -855,7 +816,7 @@ WRAPPERS = [
     ),
     Wrapper("Suzuki4", dps.Suzuki4, None, lambda order: 4, composes=True),
     Wrapper(
-        *("Sofroniou-Spaletta 6", dps.SofroniouSpaletta6, None),
+        *("Sofroniou-Spaletta 6", lambda base: dps.SofroniouSpaletta(6, base), None),
         *(lambda order: 6, True),
     ),
     Wrapper(
@@ -891,14 +852,11 @@ def offered(system: System, friction: Friction) -> frozenset[str] | Refused:
     if system.takes == "one rate" and kind != "one rate":
         return Refused("one rate")
     if system.takes == "joints":
-        known = friction.needs != "bodies" and friction.name != "Rayleigh"
-        return frozenset() if known else Refused("not of joints")
-    if friction.needs == "stiffness" and (
-        system.stiffness is None or system.mass is None
-    ):
-        return Refused("no stiffness")
+        return Refused("not of joints") if friction.needs == "bodies" else frozenset()
     if friction.needs and system.mass is None:
         return Refused("no mass")
+    if friction.name == "operator" and not isinstance(system.q, np.ndarray):
+        return Refused("not one vector")
     if friction.needs == "bodies" and not system.bodies:
         return frozenset()  # without a closed form, it is a force
     if kind == "force":
@@ -1168,7 +1126,6 @@ WAYS = [
     Way("every second step", _saved(lambda _: dfx.SaveAt(steps=2)), end=False),
     Way("times", _at_times),
     Way("everything", _everything),
-    Way("dense", _dense),
     Way("unequal steps", _unequal, prescribed=True, equal=False),
     Way("chunks", _chunks),
     Way("backwards", _backwards, end=False, backwards=True),
@@ -1200,9 +1157,8 @@ PRECISIONS = ["float64", "float32"]
 
 # What is exported and not combined here, and the file of tests that has it.
 ELSEWHERE = {
-    *("ArclengthDensity", "DistanceDensity", "StepDensityController"),  # step_density
+    "StepDensityController",  # step_density
     *("ChosenStep", "FixedStepAdjoint", "StepsBetween"),  # choose_step, adjoint
-    *("ConformalHamiltonian", "DissipativeHamiltonian"),  # functions, used above
     *("ExponentialScaling", "CustomScaling", "MirrorMap"),  # bregman
     *("Splitting", "SplittingTableau"),  # tableaus
 }

@@ -24,7 +24,6 @@ Kind = Literal[
     "split",  # a kinetic energy whose exact flow is known, and V(t, q)
     "quadratic",  # a quadratic kinetic energy, and V(t, q)
     "augmented",  # anything; the solver state holds a copy `(q, p)` in `carry[0]`
-    "coupled",  # anything; the solver state is half the difference of two copies
 ]
 
 
@@ -64,7 +63,6 @@ SCHEMES = [
         9,
         kind="augmented",
     ),
-    Scheme("coupled_4", dps.PresymplecticCoupled(4), 4, 11, kind="coupled"),
 ]
 # One scheme for each code path; the others differ only in their coefficients.
 WAYS = [
@@ -79,18 +77,17 @@ WAYS = [
         "substeps",
         "strang",
         "tao_4",
-        "coupled_4",
     }
 ]
-# One scheme for each kind of solver state: none, a force, a copy, the difference of two
-# copies. Diffrax does not depend on anything else.
+# One scheme for each kind of solver state: none, a force, a copy. Diffrax does not
+# depend on anything else.
 CARRIES = [
     scheme
     for scheme in SCHEMES
-    if scheme.name in {"leapfrog_BA", "suzuki_yoshida_4", "tao_4", "coupled_4"}
+    if scheme.name in {"leapfrog_BA", "suzuki_yoshida_4", "tao_4"}
 ]
 # Schemes that are explicit for any energy.
-ANY: tuple[Kind, ...] = ("augmented", "coupled")
+ANY: tuple[Kind, ...] = ("augmented",)
 
 # Implicit schemes for any energy, with the velocity evaluated at one end.
 _finder = optx.Newton(rtol=1e-12, atol=1e-12)

@@ -125,7 +125,7 @@ TS = jnp.array([0.0, 0.05, 0.05, 0.3, 0.71, 1.0])
     [
         dict(t0=True, t1=True, steps=3),
         dict(ts=TS, steps=2, t1=True, t0=True),
-        dict(dense=True, t1=True, solver_state=True),
+        dict(t1=True, solver_state=True),
         dict(
             subs=[
                 dfx.SubSaveAt(ts=TS, fn=energy),

@@ -24,8 +24,6 @@ DRIVEN = dps.ConformalHamiltonian(dps.QuadraticKinetic(), driven, dps.LogDamping
 def test_energies():
     ts, ys = jnp.array([0.0, 3.0]), tuple(jnp.array([[[1.0], [2.0]], [[0.0], [1.0]]]))
     assert_close(diagnostics.energy(TERM, ts, ys), jnp.array([0.5, 2.5]), 1e-15)
-    canonical = jnp.array([0.5, 2.5 * np.exp(0.6)])
-    assert_close(diagnostics.canonical_energy(TERM, ts, ys), canonical, 1e-15)
 
 
 @pytest.mark.variants(1)
@@ -58,14 +56,3 @@ def test_structure_defect():
     assert defect(dps.BlanesCasasRKN8()) < 1e-13
     assert 1e-9 < defect(dfx.Tsit5()) < 1e-3
     assert 1e-3 < defect(dfx.Euler())
-
-
-@pytest.mark.parametrize(
-    "solver, order",
-    [(dps.PresymplecticEuler(), 1), (dps.BlanesMoan4(), 4), (dfx.Bosh3(), 3)],
-)
-def test_convergence_order(solver, order):
-    measured = diagnostics.convergence_order(DRIVEN, solver, 1.0, 3.0, Y0, 20, 0.7)
-    assert abs(measured - order) < 0.2
-    with pytest.raises(ValueError, match="steps"):
-        diagnostics.convergence_order(DRIVEN, solver, 1.0, 3.0, Y0, 0, 0.7)

@@ -382,7 +382,7 @@ def test_the_term_in_other_solvers(solver, adapts, tolerance):
         *(TERM, solver, 1.0, 2.0, 1 / 512, Y0, ARGS),
         stepsize_controller=controller if adapts else dfx.ConstantStepSize(),
     )
-    y, _ = go(Scheme("", dps.SofroniouSpaletta8(), 8, 21), 1.0, 2.0, Y0)
+    y, _ = go(Scheme("", dps.SofroniouSpaletta(8), 8, 21), 1.0, 2.0, Y0)
     assert_close(jtu.tree_map(lambda y: y[-1], sol.ys), y, tolerance)
 
 

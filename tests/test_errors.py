@@ -185,7 +185,7 @@ def test_nonseparable_energies_need_a_root_finder(scheme: Scheme, hamiltonian):
     assert f"This `{type(hamiltonian).__name__}` is not separable" in message
     # All three alternatives.
     newton = "`root_finder=optimistix.Newton(rtol=1e-10, atol=1e-10)`"
-    assert all(x in message for x in (newton, "`PresymplecticCoupled()`", PARTS))
+    assert all(x in message for x in (newton, "`PresymplecticGauss()`", PARTS))
 
 
 SPLIT = "a system split into a kinetic part and a potential"
@@ -214,12 +214,8 @@ def test_nystroem_splittings_need_a_quadratic_kinetic_energy(solver):
 @pytest.mark.parametrize("options", [{}, {"step_ts": jnp.array([0.5])}], ids=str)
 def test_step_sizes_by_error_estimate(solver, options):
     controller = dfx.PIDController(rtol=1e-3, atol=1e-3, **options)
-    with pytest.raises(ValueError) as error:
+    with pytest.raises(RuntimeError, match="does not provide error estimates"):
         trace(TERM, solver, stepsize_controller=controller)
-    Mistake(
-        "have no error estimate", "which the step size controller needs", "`dt0=choose_"
-    ).check(error)
-    assert "`diffrax.HalfSolver(solver)`" in str(error.value)
     trace(TERM, dfx.HalfSolver(solver), stepsize_controller=controller)
 
 
@@ -536,7 +532,7 @@ HAMILTONIANS = {
     "energy and damping by position": (
         lambda: dps.ConformalHamiltonian(mixed_energy, DAMPING),
         Mistake(
-            "got ConstantDamping(",
+            "got Damping(",
             "`potential` must be a function `V(t, q, args)`",
             "write `Hamiltonian(energy)`",
         ),
@@ -548,22 +544,6 @@ HAMILTONIANS = {
             "`potential` must be a function `V(t, q, args)`",
             "The order is `(kinetic, potential, friction)`",
         ),
-    ),
-    "kinetic energy of `p` alone said to depend on `q`": (
-        lambda: dps.DissipativeHamiltonian(
-            KINETIC, harmonic, DAMPING, DAMPING, separable=False
-        ),
-        Mistake(
-            "got QuadraticKinetic(",
-            "`DissipativeHamiltonian(..., separable=False)` needs",
-            "a function `T(t, q, P, args)`",
-        ),
-    ),
-    "potential of the general family is no function": (
-        lambda: dps.DissipativeHamiltonian(
-            lambda t, q, P, args: jnp.sum(P**2), 3.0, DAMPING, DAMPING, separable=False
-        ),
-        Mistake("got 3.0", "`potential` must be a function", "`f(t, q, args)`"),
     ),
 }
 

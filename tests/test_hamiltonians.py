@@ -77,6 +77,11 @@ def constant(t):
     return 0.7 * t
 
 
+def dissipative_energy(t, q, p, args):
+    kinetic = canonical_kinetic(t, q, jnp.exp(constant(t)) * p, args)
+    return jnp.exp(-log(t) - constant(t)) * kinetic + potential(t, q, args)
+
+
 HAMILTONIANS = {
     "separable, quadratic T": (
         dps.MechanicalSystem(QUADRATIC, potential),
@@ -127,9 +132,7 @@ HAMILTONIANS = {
         dissipative(lambda t, q, P: kinetic(t, P, ARGS), log, constant),
     ),
     "dissipative, nonseparable": (
-        dps.DissipativeHamiltonian(
-            canonical_kinetic, potential, LOG, CONSTANT, separable=False
-        ),
+        dps.Hamiltonian(dissipative_energy, CONSTANT),
         dissipative(lambda t, q, P: canonical_kinetic(t, q, P, ARGS), log, constant),
     ),
 }

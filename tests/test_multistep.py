@@ -43,7 +43,7 @@ LAWS = {
 Y0 = (jnp.array([1.0, -0.5]), jnp.array([0.2, 0.4]))
 ONE = jnp.array(1.0)
 # An integrator of another kind, whose order does not depend on the law.
-EXACT = dps.SofroniouSpaletta10()
+EXACT = dps.SofroniouSpaletta(10)
 
 
 # Coefficients

@@ -37,44 +37,10 @@ def energy_errors(solver, dt0):
 def test_energy_errors_do_not_grow():
     for solver, dt0 in [
         (dps.PresymplecticTao(), 1 / 40),
-        (dps.PresymplecticCoupled(), 1 / 40),
-        (dps.PresymplecticCoupled(4), 1 / 10),
+        (dps.PresymplecticGauss(2), 1 / 10),
     ]:
         first, last = energy_errors(solver, dt0)
         assert last < 1.2 * first
-
-
-def test_free_copies_are_more_accurate_at_equal_cost():
-    tao = energy_errors(dps.PresymplecticTao(), 1 / 40)[1]
-    assert 5 * energy_errors(dps.PresymplecticCoupled(), 1 / 40)[1] < tao
-    # With a coupling of 10, which is optimal.
-    tao_4 = energy_errors(dps.Suzuki4(dps.PresymplecticTao(10.0)), 1 / 20)[1]
-    coupled_4 = energy_errors(dps.PresymplecticCoupled(4), 1 / 20 * 11 / 15)[1]
-    assert 100 * coupled_4 < tao_4
-
-
-@pytest.mark.parametrize("order", [2, 4])
-def test_copies_that_pass_zero_have_not_parted(order):
-    # From rest, to which the momentum returns with an error larger than itself.
-    sol = solve(MIXED, dps.PresymplecticCoupled(order), 0.0, 50.0, 1 / 20, START)
-    assert sol.result == dfx.RESULTS.successful
-
-
-STRETCH = 40.0
-
-
-def stretched_energy(t, q, p, args):
-    return mixed_energy(t, q / STRETCH, p * STRETCH, args)
-
-
-def test_scale_undoes_units():
-    y0 = (STRETCH * START[0], START[1] / STRETCH)
-    solver = dps.PresymplecticCoupled(4, scale=STRETCH**2)
-    stretched = dps.Hamiltonian(stretched_energy)
-    sol: Any = solve(stretched, solver, 0.0, 10.0, 1 / 8, y0)
-    q, p = sol.ys
-    plain = solve(MIXED, dps.PresymplecticCoupled(4), 0.0, 10.0, 1 / 8, START).ys
-    assert_close((q / STRETCH, p * STRETCH), plain, 1e-10)
 
 
 # Friction over long times
@@ -84,11 +50,8 @@ def canonical_energy(t, q, P, args):
     return DAMPED.canonical(t, q, DAMPED.from_canonical(t, P))
 
 
-@pytest.mark.parametrize(
-    "solver, dt0",
-    [(dps.PresymplecticTao(), 1 / 16), (dps.PresymplecticCoupled(4, scale=1.5), 1 / 8)],
-)
-def test_damped_motion_stays_finite_and_conformal(solver, dt0):
+def test_damped_motion_stays_finite_and_conformal():
+    solver, dt0 = dps.PresymplecticTao(), 1 / 16
     sol = solve(DAMPED, solver, 0.0, 1000.0, dt0, START, max_steps=None)
     assert sol.result == dfx.RESULTS.successful
     # At small amplitude the system is the oscillator, with the same decay.
@@ -101,11 +64,8 @@ def test_damped_motion_stays_finite_and_conformal(solver, dt0):
 
         def doubled(x):
             (q, p), copy = unravel(x)
-            carry = copy
-            if isinstance(solver, dps.PresymplecticTao):
-                t0 = jnp.array(1000.0)
-                at = (t0, q, copy[1])
-                carry = copy, (DAMPED.velocity(*at), DAMPED.force(*at))
+            at = jnp.array(1000.0), q, copy[1]
+            carry = copy, (DAMPED.velocity(*at), DAMPED.force(*at))
             y, _, _, carry, _ = solver.step(
                 DAMPED,
                 *(jnp.array(1000.0), jnp.array(1000.0 + dt0), (q, p), None),
@@ -131,16 +91,6 @@ def test_a_coupling_of_canonical_momenta_fails():
     assert sol.result != dfx.RESULTS.successful
 
 
-# Structure. The projected scheme is not symplectic; uncoupled copies are.
-
-T0, H0 = jnp.array(0.5), 1 / 16
-WAVY = dps.ConformalHamiltonian(energy=mixed_energy, damping=dps.LogDamping(2.0))
-Y0 = (jnp.array([0.5, -0.3]), jnp.array([0.2, 0.4]))
-
-
-# Implicit schemes
-
-
 # Errors and failures
 
 NOTHING: Any = None
@@ -153,7 +103,6 @@ def cost(t, q, args):
 ENTROPIC = dps.BregmanHamiltonian(dps.EntropyMirror(), cost, dps.PolynomialScaling(2.0))
 ANY = {
     "tao": dps.PresymplecticTao(),
-    "coupled": dps.PresymplecticCoupled(4),
     "midpoint": dps.PresymplecticGauss(1, FINDER),
     "leapfrog": dps.PresymplecticLeapfrog("momentum", FINDER),
 }
@@ -167,7 +116,7 @@ def test_outside_of_the_domain_is_a_result(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["tao", "coupled", "midpoint"])
+@pytest.mark.parametrize("name", ["tao", "midpoint"])
 def test_every_scheme_finds_bregman_motion(name):
     y0 = (jnp.array([0.3, 0.5]), jnp.array([0.1, -0.2]))
     exact = solve(ENTROPIC, dps.BlanesMoan6(), 1.0, 2.0, 1 / 16, y0).ys

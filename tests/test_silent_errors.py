@@ -115,27 +115,12 @@ def test_equal_laws_from_a_singularity_are_equally_accurate():
     ends = []
     for law in (
         dps.LogDamping(numbers),
-        dps.ViscousDamping(numbers, dps.LogDamping(1.0)),
         [dps.LogDamping(numbers - 1), dps.LogDamping(1.0)],
     ):
         system = dps.MechanicalSystem(dps.QuadraticKinetic(), pendulum, friction=law)
         ends.append(last(solve(system, dps.TunedRKN6(), 0.0, 2.0, 0.25, y0)))
     for end in ends[1:]:
         np.testing.assert_allclose(end[0], ends[0][0], rtol=1e-12)
-
-
-def test_a_matrix_times_a_law_from_its_singularity():
-    # A matrix that is a number.
-    ends = []
-    for law in (
-        dps.ViscousDamping(3.0 * jnp.eye(2), dps.LogDamping(1.0)),
-        dps.LogDamping(3.0),
-    ):
-        system = dps.MechanicalSystem(dps.QuadraticKinetic(), harmonic, friction=law)
-        y0 = jnp.array([1.0, 2.0]), jnp.zeros(2)
-        ends.append(last(solve(system, dps.TunedRKN6(), 0.0, 2.0, 0.125, y0)))
-    assert np.all(np.isfinite(ends[0]))
-    np.testing.assert_allclose(ends[0], ends[1], atol=1e-5)
 
 
 @pytest.mark.parametrize("size", [5.0, 11.0, 14.0])

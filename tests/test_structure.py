@@ -93,12 +93,10 @@ def canonical_form(n, copies=1):
 def doubled_step(hamiltonian, solver, t0, t1, y, copy):
     """One step of the whole state of an augmented scheme."""
     (q, _), (_, p_copy) = y, copy
-    carry = copy
-    if not isinstance(solver, dps.PresymplecticCoupled):
-        field = hamiltonian.velocity(t0, q, p_copy), hamiltonian.force(t0, q, p_copy)
-        carry = copy, field
+    field = hamiltonian.velocity(t0, q, p_copy), hamiltonian.force(t0, q, p_copy)
+    carry = copy, field
     y, _, _, carry, _ = solver.step(hamiltonian, t0, t1, y, None, carry, False)
-    # The first leaves are the copy, or the difference.
+    # The first leaves are the copy.
     return y, jtu.tree_leaves(carry)[:2]
 
 
@@ -117,11 +115,9 @@ def jacobian(hamiltonian, solver, t0, t1, *state):
 
 def structure_defect(hamiltonian, scheme, contraction):
     y = (Q0, P0)
-    # Different copies, as in the middle of a solve; or half their difference, which is
-    # an equivalent coordinate.
+    # Different copies, as in the middle of a solve.
     copy = (Q0 + 0.01, P0 - 0.02)
-    state = {"augmented": (y, copy), "coupled": (y, (0.01 * Q0, -0.02 * P0))}
-    state = state.get(scheme.kind, (y,))
+    state = (y, copy) if scheme.kind == "augmented" else (y,)
     J = np.asarray(jacobian(hamiltonian, scheme.solver, T0, T1, *state))
     form = canonical_form(2, len(state))
     return np.max(np.abs(J.T @ form @ J - contraction * form))

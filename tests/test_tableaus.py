@@ -20,9 +20,9 @@ TABULATED = {name: getattr(dps, name)() for name in TABLES if name.startswith("B
 SPLITTINGS = TABULATED | {"TunedRKN6": dps.TunedRKN6()}
 COMPOSITIONS = {
     "Suzuki4": dps.Suzuki4(),
-    "SofroniouSpaletta6": dps.SofroniouSpaletta6(),
-    "SofroniouSpaletta8": dps.SofroniouSpaletta8(),
-    "SofroniouSpaletta10": dps.SofroniouSpaletta10(),
+    "SofroniouSpaletta6": dps.SofroniouSpaletta(6),
+    "SofroniouSpaletta8": dps.SofroniouSpaletta(8),
+    "SofroniouSpaletta10": dps.SofroniouSpaletta(10),
     "SuzukiYoshida4": dps.SuzukiYoshida(4),
     "SuzukiYoshida6": dps.SuzukiYoshida(6),
     "SuzukiYoshida8": dps.SuzukiYoshida(8),

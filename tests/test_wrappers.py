@@ -51,7 +51,7 @@ def test_a_wrapped_step_is_the_step(scheme: Scheme, wrap):
     assert_close(one_step(wrap(scheme.solver)), expected, 1e-15)
 
 
-@pytest.mark.parametrize("kind", ["tao_fixed", "coupled_4", "leapfrog_AB", "strang"])
+@pytest.mark.parametrize("kind", ["tao_fixed", "leapfrog_AB", "strang"])
 def test_any_nesting_of_wrappers(kind):
     (scheme,) = (scheme for scheme in SCHEMES if scheme.name == kind)
     expected = one_step(scheme.solver)
@@ -98,7 +98,6 @@ def test_wrappers_keep_what_the_scheme_has(wrap):
         dps.PresymplecticLeapfrog(),
         dps.Substeps(dps.Strang(), 2),
         pytest.param(dps.PresymplecticTao(5.0), marks=pytest.mark.slow),
-        pytest.param(dps.PresymplecticCoupled(2), marks=pytest.mark.slow),
     ],
     ids=lambda solver: type(solver).__name__,
 )

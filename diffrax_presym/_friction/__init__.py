@@ -1,14 +1,11 @@
 from ._base import AbstractFriction as AbstractFriction
 from ._damping import (
-    AbstractDamping as AbstractDamping,
     ConstantDamping as ConstantDamping,
+    Damping as Damping,
     LogDamping as LogDamping,
     PowerDamping as PowerDamping,
 )
 from ._drag import Drag as Drag
 from ._log_scale import AbstractLogScale as AbstractLogScale
 from ._position import PositionDamping as PositionDamping
-from ._viscous import (
-    RayleighDamping as RayleighDamping,
-    ViscousDamping as ViscousDamping,
-)
+from ._viscous import ViscousDamping as ViscousDamping

@@ -16,11 +16,16 @@ from ._log_scale import AbstractLogScale
 Form = PyTree[Inexact[Array, "..."]] | lx.AbstractLinearOperator | None
 
 
-class Mechanics(NamedTuple):
-    """What friction needs to know of a system; `None` if that is not known."""
+# The names of forms, for errors.
+MASS = "`QuadraticKinetic(mass)`"
+COEFFICIENTS = "`ViscousDamping(coefficients)`"
+DAMPING = "The damping"
 
-    mass: Any
-    stiffness: Any = None
+
+class Mechanics(NamedTuple):
+    """What friction needs to know of a system."""
+
+    mass: Any = None
     has_mass: bool = True
     mass_varies: bool = False  # with the place, so that there are no exact drifts
 
@@ -45,8 +50,7 @@ class Parts(NamedTuple):
 
     linear: tuple[Linear, ...] = ()
     local: tuple[Local, ...] = ()
-    drags: tuple[Any, ...] = ()  # of `Drag`, in the drift
-    local_drags: tuple[Any, ...] = ()  # of `Drag`, in the kick
+    drags: tuple[Any, ...] = ()  # of `Drag`, part of every kick
     forces: tuple[Any, ...] = ()  # part of the force alone
 
     def __add__(self, other: "Parts") -> "Parts":  # pyright: ignore
@@ -58,8 +62,8 @@ class AbstractFriction(eqx.Module):
     """A law of friction, for the argument `friction=` of a system.
 
     Where it acts in a step depends on what it is: linear friction that depends on time
-    alone is part of the drifts, and exact; friction by place is part of the kicks, and
-    drag by speed part of either.
+    alone is part of the drifts, and exact; friction by place or by speed is part of the
+    kicks.
     """
 
     @abc.abstractmethod

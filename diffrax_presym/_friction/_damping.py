@@ -1,8 +1,8 @@
 """Friction by rates: of all momenta alike, or of each entry."""
 
-import abc
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -24,18 +24,17 @@ from ._log_scale import (
 Numbers = PyTree[Inexact[Array, "..."]]
 
 
-class AbstractDamping(AbstractFriction):
+class Damping(AbstractFriction):
     r"""Friction $p' = F - \eta'(t) \, p$ at a rate, in units of one over time.
 
-    Positive rates damp, negative rates excite. The log scale $\eta$ is one number for
+    Made by [`diffrax_presym.ConstantDamping`][], [`diffrax_presym.LogDamping`][] and
+    [`diffrax_presym.PowerDamping`][]. Positive rates damp, negative rates excite. The
+    log scale $\eta$ is a sum of functions of time, each with a factor: one number for
     friction alike on all momenta; or an array with as many dimensions as `p` that
     broadcasts to it, or a pytree of these, with a rate for each degree of freedom.
     """
 
-    @property
-    @abc.abstractmethod
-    def terms(self) -> tuple[tuple[AbstractLogScale, Numbers], ...]:
-        """The log scales of which it is the sum, each with its factor."""
+    terms: tuple[tuple[AbstractLogScale, Any], ...]
 
     def parts(self, mechanics: Mechanics) -> Parts:
         return Parts(tuple(LinearPart(*term) for term in self.terms))
@@ -78,39 +77,30 @@ def as_numbers(x, name: str) -> Numbers:
     return jtu.tree_map(lambda x: as_finite(x, name), x)
 
 
-class ConstantDamping(AbstractDamping):
+def ConstantDamping(gamma) -> Damping:
     r"""Friction $-\gamma \, p$ at a constant rate $\gamma$, in units of one over time.
 
     The log scale is $\eta(t) = \gamma t$: the heavy-ball method and the damped
     oscillator, equation (eta1_large) of França, Jordan and Vidal (2021). For friction
     by a coefficient, in units of force per velocity, write
     [`diffrax_presym.ViscousDamping`][].
+
+    **Arguments:**
+
+    - `gamma`: the rate of damping, in units of one over time. Real, of any sign;
+        negative excites. A number, or for [`diffrax_presym.MechanicalSystem`][] a rate
+        for each degree of freedom: an array with as many dimensions as `p` that
+        broadcasts to it, or a pytree of these.
+
+    **Raises:**
+
+    `ValueError` if it is not a finite real number or array; and when the solve is
+    traced, if it does not fit `p`.
     """
-
-    gamma: Numbers
-
-    def __init__(self, gamma):
-        """**Arguments:**
-
-        - `gamma`: the rate of damping, in units of one over time. Real, of any sign;
-            negative excites. A number, or for
-            [`diffrax_presym.MechanicalSystem`][] a rate for each degree of freedom: an
-            array with as many dimensions as `p` that broadcasts to it, or a pytree of
-            these.
-
-        **Raises:**
-
-        `ValueError` if it is not a finite real number or array; and when the solve is
-        traced, if it does not fit `p`.
-        """
-        self.gamma = as_numbers(gamma, "`ConstantDamping(gamma)`")
-
-    @property
-    def terms(self):
-        return ((Linear(), self.gamma),)
+    return Damping(((Linear(), as_numbers(gamma, "`ConstantDamping(gamma)`")),))
 
 
-class LogDamping(AbstractDamping):
+def LogDamping(gamma, shift: ArrayLike | None = None) -> Damping:
     r"""Friction that decays with time, $-\gamma \, p / (t + s)$.
 
     The log scale is $\eta(t) = \gamma \log(t + s)$. With $\gamma = 3$ and no shift this
@@ -122,29 +112,20 @@ class LogDamping(AbstractDamping):
     order $\gamma + 1$, and other schemes order 2. Schemes whose stages extend beyond
     the step, such as [`diffrax_presym.PresymplecticYoshida4`][], must start far enough
     from there; otherwise the solve fails.
+
+    **Arguments:**
+
+    - `gamma`: the strength of the damping, dimensionless, of any sign. A number, array
+        or pytree as for [`diffrax_presym.ConstantDamping`][].
+    - `shift`: the shift $s$ of time, in units of time: a number. Defaults to none.
     """
-
-    gamma: Numbers
-    shift: Inexact[ArrayLike, "..."] | None
-
-    def __init__(self, gamma, shift: ArrayLike | None = None):
-        """**Arguments:**
-
-        - `gamma`: the strength of the damping, dimensionless, of any sign. A number,
-            array or pytree as for [`diffrax_presym.ConstantDamping`][].
-        - `shift`: the shift $s$ of time, in units of time: a number. Defaults to none.
-        """
-        self.gamma = as_numbers(gamma, "`LogDamping(gamma)`")
-        self.shift = shift
-        if shift is not None:
-            self.shift = as_finite(shift, "`LogDamping(shift=...)`")
-
-    @property
-    def terms(self):
-        return ((Logarithm(self.shift), self.gamma),)
+    if shift is not None:
+        shift = as_finite(shift, "`LogDamping(shift=...)`")
+    gamma = as_numbers(gamma, "`LogDamping(gamma)`")
+    return Damping(((Logarithm(shift), gamma),))
 
 
-class PowerDamping(AbstractDamping):
+def PowerDamping(gamma, delta) -> Damping:
     r"""Friction that varies like a power of time, $-\gamma \delta t^{\delta - 1} \, p$.
 
     The log scale is $\eta(t) = \gamma t^\delta$. With an exponent between 0 and 1, and
@@ -153,44 +134,25 @@ class PowerDamping(AbstractDamping):
     Vidal (2021) is `friction=[LogDamping(gamma1), PowerDamping(gamma2, delta)]`. Time
     must not be negative; from $t = 0$, where the rate is infinite for an exponent below
     1, a solve may start from zero momentum, with order 2.
+
+    **Arguments:**
+
+    - `gamma`: the strength, in units of time to the power $-\delta$. A number, array or
+        pytree as for [`diffrax_presym.ConstantDamping`][].
+    - `delta`: the exponent, a number.
     """
-
-    gamma: Numbers
-    delta: Inexact[ArrayLike, "..."]
-
-    def __init__(self, gamma, delta):
-        r"""**Arguments:**
-
-        - `gamma`: the strength, in units of time to the power $-\delta$. A number,
-            array or pytree as for [`diffrax_presym.ConstantDamping`][].
-        - `delta`: the exponent, a number.
-        """
-        self.gamma = as_numbers(gamma, "`PowerDamping(gamma, ...)`")
-        self.delta = as_finite(delta, "`PowerDamping(..., delta)`")
-
-    @property
-    def terms(self):
-        return ((Power(self.delta), self.gamma),)
-
-
-class CustomDamping(AbstractDamping):
-    """Friction given by its log scale, of all momenta alike or by entry."""
-
-    log_scale: AbstractLogScale
-
-    @property
-    def terms(self):
-        return ((self.log_scale, jnp.ones(())),)
+    delta = as_finite(delta, "`PowerDamping(..., delta)`")
+    gamma = as_numbers(gamma, "`PowerDamping(gamma, ...)`")
+    return Damping(((Power(delta), gamma),))
 
 
 def as_friction(law, name: str = "`friction`") -> AbstractFriction:
     """A user's law of friction; a function `eta(t)` is one too."""
     if isinstance(law, AbstractFriction):
         return law
-    if isinstance(law, AbstractLogScale):
-        return CustomDamping(law)
     if callable(law):
-        return CustomDamping(FunctionOfTime(law))
+        law = law if isinstance(law, AbstractLogScale) else FunctionOfTime(law)
+        return Damping(((law, jnp.ones(())),))
     raise ValueError(
         f"{name} must be a law of friction, a function eta(t) or a list of these, but "
         f"got {law!r}. For a constant rate write `ConstantDamping(rate)`, for a "

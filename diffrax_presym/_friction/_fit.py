@@ -7,27 +7,22 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import lineax as lx
 from jaxtyping import Array, PyTree
 
 from .._forms import fit_form, is_matrix, is_operator
-from ._base import Form, Linear as LinearPart, Mechanics, Parts
-from ._damping import AbstractDamping
-from ._linear import LinearFriction
-from ._log_scale import (
-    AbstractLogScale,
-)
-from ._rates import (
+from ._base import (
     COEFFICIENTS,
-    CoupledFriction,
     DAMPING,
-    EntryFriction,
-    identity,
+    Form,
+    Linear as LinearPart,
     MASS,
-    MatrixRate,
-    ProductRate,
-    Ravel,
+    Mechanics,
+    Parts,
 )
+from ._damping import Damping
+from ._leaf import EntryFriction, identity, MatrixFriction
+from ._linear import LinearFriction
+from ._log_scale import AbstractLogScale
 
 
 def fit_friction(
@@ -36,35 +31,27 @@ def fit_friction(
     """The linear friction of some parts together, for momenta like `p`."""
     if not parts:
         return None
-    forms = [part.form for part in parts]
-    if any(part.per_velocity for part in parts):
-        forms.append(mechanics.mass)
-    joined = any(map(is_operator, forms))
-    ravel = Ravel(p, joined)
-    if joined:
-        return LinearFriction((_by_products(parts, mechanics, p, ravel),), ravel)
     columns = [_rates(part, mechanics, p) for part in parts]
     laws = [part.log_scale for part in parts]
-    rows = zip(*columns, strict=True)
-    like = jtu.tree_leaves(p)
-    merged = [
-        _merged(list(zip(laws, row, strict=True)), x)
-        for row, x in zip(rows, like, strict=True)
+    like, structure = jtu.tree_flatten(p)
+    leaves = [
+        _leaf_friction(list(zip(laws, rates, strict=True)), x)
+        for *rates, x in zip(*columns, like, strict=True)
     ]
-    return LinearFriction(tuple(merged), ravel)
+    precision = max(float(jnp.finfo(x.dtype).eps) for x in like)
+    return LinearFriction(structure.unflatten(leaves), precision)
 
 
 def _rates(part: LinearPart, mechanics: Mechanics, p: PyTree) -> list[Array]:
     """The rate of each leaf: of its entries, or as a matrix."""
     name = COEFFICIENTS if part.per_velocity else DAMPING
-    rates = jtu.tree_leaves(fit_form(part.form, p, name, "p"))
+    like, form = jtu.tree_leaves(p), _as_array(part.form, p, name)
+    rates = jtu.tree_leaves(fit_form(form, p, name, "p"))
     if part.per_velocity:
-        masses = jtu.tree_leaves(fit_form(mechanics.mass, p, MASS, "p"))
-        rows = zip(rates, masses, jtu.tree_leaves(p), strict=True)
+        mass = fit_form(_as_array(mechanics.mass, p, MASS), p, MASS, "p")
+        rows = zip(rates, jtu.tree_leaves(mass), like, strict=True)
         return [_per_momentum(*row) for row in rows]
-    if any(
-        is_matrix(x, like) for x, like in zip(rates, jtu.tree_leaves(p), strict=True)
-    ):
+    if any(is_matrix(x, xi) for x, xi in zip(rates, like, strict=True)):
         raise ValueError(
             "The damping is a matrix that couples the entries of `p`. Friction by a "
             "matrix is given per velocity: write `ViscousDamping(matrix)`."
@@ -72,9 +59,23 @@ def _rates(part: LinearPart, mechanics: Mechanics, p: PyTree) -> list[Array]:
     return rates
 
 
-def _merged(
+def _as_array(form: Form, p: PyTree, name: str) -> Any:
+    """An operator as its matrix."""
+    if not is_operator(form):
+        return form
+    structure = jtu.tree_structure(p)
+    if not jtu.treedef_is_leaf(structure) or jnp.ndim(p) != 1:
+        raise ValueError(
+            f"{name} is an operator, which with friction per velocity needs positions "
+            f"and momenta in one vector, but `p` is {structure}. Write a matrix for "
+            "each leaf, or the friction as `MechanicalSystem(..., force=f)`."
+        )
+    return form.as_matrix()  # pyright: ignore[reportOptionalMemberAccess]
+
+
+def _leaf_friction(
     terms: list[tuple[AbstractLogScale, Array]], like: Array
-) -> EntryFriction | CoupledFriction:
+) -> EntryFriction | MatrixFriction:
     coupled = any(is_matrix(rate, like) for _, rate in terms)
     # Laws of one log scale are one law.
     same: dict[Any, list[tuple[AbstractLogScale, Array]]] = {}
@@ -83,19 +84,17 @@ def _merged(
         key = structure, tuple(map(id, leaves))
         same.setdefault(key, []).append((law, rate))
     terms = [(group[0][0], _sum(group, like, coupled)) for group in same.values()]
-    for law, _ in terms:
-        _check_values(law, like, coupled)
     if not coupled:
+        for law, _ in terms:
+            _check_values(law, like)
         return EntryFriction(tuple(terms))
     if len(terms) > 1:
         raise ValueError(
             "Friction by a matrix and friction that depends on time have no exact flow "
-            f"together, but there are {len(terms)} laws. Write one "
-            "`ViscousDamping(C, law)`; or all but one as `ViscousDamping(function)` "
-            "with a function `C(t, q, args)`, which is part of the kicks."
+            "together. Write the matrix as `ViscousDamping(function)`, with a function "
+            "`C(t, q, args)`, which is part of the kicks."
         )
-    ((law, rate),) = terms
-    return CoupledFriction(law, MatrixRate(rate))
+    return MatrixFriction(terms[0][1])
 
 
 def _sum(
@@ -109,13 +108,8 @@ def _sum(
     return functools.reduce(jnp.add, rates)
 
 
-def _check_values(law: AbstractLogScale, like: Array, coupled: bool) -> None:
+def _check_values(law: AbstractLogScale, like: Array) -> None:
     shape = jax.eval_shape(law.rate, jnp.zeros(())).shape
-    if coupled and shape != ():
-        raise ValueError(
-            "The law in `ViscousDamping(C, law)` with a matrix must be one rate for "
-            f"all momenta, but has shape {shape}. Multiply the matrix by the numbers."
-        )
     if len(shape) > jnp.ndim(like):
         raise ValueError(
             f"The damping has shape {shape} for a `p` of shape {jnp.shape(like)}. "
@@ -123,36 +117,6 @@ def _check_values(law: AbstractLogScale, like: Array, coupled: bool) -> None:
             "`ViscousDamping(matrix)`."
         )
     fit_form(jnp.zeros(shape), like, DAMPING, "p")
-
-
-def _by_products(
-    parts: Sequence[LinearPart], mechanics: Mechanics, p: PyTree, ravel: Ravel
-) -> CoupledFriction:
-    laws = [part.log_scale for part in parts]
-    if len(parts) > 1 and not all(law.is_autonomous for law in laws):
-        _merged([(law, jnp.zeros((2, 2))) for law in laws], jnp.zeros(2))
-    rates = tuple(part.form for part in parts if not part.per_velocity)
-    coefficients = tuple(part.form for part in parts if part.per_velocity)
-    rate = ProductRate(rates, coefficients, mechanics.mass, ravel)
-    _check_values(laws[0], ravel(p), coupled=True)
-    if not any(map(_is_implicit, (*rates, *coefficients, mechanics.mass))):
-        rate = MatrixRate(rate.dense())
-    return CoupledFriction(laws[0], rate)
-
-
-def _is_implicit(form: Form) -> bool:
-    """Whether a form is an operator that is not given by its entries."""
-    known = (
-        lx.MatrixLinearOperator,
-        lx.DiagonalLinearOperator,
-        lx.TridiagonalLinearOperator,
-        lx.IdentityLinearOperator,
-    )
-    if not is_operator(form) or isinstance(form, known):
-        return False
-    # Sums, products and tags of operators.
-    parts = [x for x in vars(form).values() if is_operator(x)]
-    return not parts or any(map(_is_implicit, parts))
 
 
 def _per_momentum(coefficient: Array, mass: Array, p: Array) -> Array:
@@ -176,43 +140,27 @@ def _as_matrix(rate: Array, like: Array) -> Array:
     return entries[..., None] * identity(entries)
 
 
-class SumDamping(AbstractDamping):
-    """Several laws of one rate for all momenta, as one."""
-
-    laws: tuple[tuple[AbstractLogScale, Any], ...]
-
-    @property
-    def terms(self):
-        return self.laws
-
-
-def one_rate(parts: Parts) -> AbstractDamping | None:
+def one_rate(parts: Parts) -> Damping | None:
     """The law of friction, if that is one rate for all momenta and nothing else.
 
     `ValueError` if there is any other friction.
     """
-    linear, *rest = parts
-    shape = lambda part: jtu.tree_map(jnp.shape, part.form)
-    values = lambda part: jax.eval_shape(part.log_scale.rate, jnp.zeros(()))
-    scalar = all(
-        not part.per_velocity and shape(part) == () and values(part).shape == ()
-        for part in linear
-        if not is_operator(part.form)
-    )
-    if any(rest) or any(is_operator(part.form) for part in linear) or not scalar:
+    if not has_one_rate(parts):
         raise ValueError(
             "Only one rate of damping for all momenta has a log scale and a canonical "
             "momentum, but this system has other friction. Write "
-            "`ConstantDamping(rate)` with a number; or use `energy(t, q, p)`, and "
-            "`diagnostics.volume_defect` for linear friction."
+            "`ConstantDamping(rate)` with a number; or use `energy(t, q, p)`."
         )
-    terms = tuple((part.log_scale, part.form) for part in linear)
-    return SumDamping(terms) if terms else None
+    terms = tuple((part.log_scale, part.form) for part in parts.linear)
+    return Damping(terms) if terms else None
 
 
 def has_one_rate(parts: Parts) -> bool:
-    try:
-        one_rate(parts)
-    except ValueError:
-        return False
-    return True
+    def is_number(part: LinearPart) -> bool:
+        if part.per_velocity or is_operator(part.form):
+            return False
+        values = jax.eval_shape(part.log_scale.rate, jnp.zeros(()))
+        return jtu.tree_map(jnp.shape, part.form) == () and values.shape == ()
+
+    linear, *other = parts
+    return not any(other) and all(map(is_number, linear))

@@ -1,13 +1,14 @@
 """Log scales: how a rate of friction depends on time, apart from its size.
 
-The friction at the rate eta'(t) G, with any constant G, makes a momentum decay by
-exp(-x G) where x is the difference of eta. What it does besides are integrals of such
-exponentials, which each log scale states for numbers and matrices G alike.
+The friction at the rate eta'(t) g, with any constant g, makes a momentum decay by
+exp(-x g) where x is the difference of eta. What it does besides are integrals of such
+exponentials.
 """
 
 import abc
-from collections.abc import Callable
-from typing import ClassVar
+import functools
+from collections.abc import Callable, Sequence
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,30 +16,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from .._misc import as_time, cast_to, Scalar, Time
-from ._exponential import expm1, gauss_legendre
+from ._exponential import expm1, expm1_ratio, gauss_legendre
 
 
-class Integral(eqx.Module):
-    r"""A multiple of $\int_0^x e^{-s (G + c)} \, \mathrm ds$."""
+class Effect(NamedTuple):
+    """What friction does to a leaf over a span: numbers for its entries, or matrices.
 
-    factor: Scalar
-    x: Scalar
-    shift: float = eqx.field(static=True)  # c
+    A matrix that is not exponentiated has the time in place of all three.
+    """
 
-
-class Quadrature(eqx.Module):
-    r"""A sum $\sum_j w_j e^{-x_j G}$."""
-
-    weights: Inexact[Array, " nodes"]
-    x: Inexact[Array, "nodes ..."]
-
-
-class Exponents(eqx.Module):
-    """What friction does over a span, but for the size of its rate."""
-
-    x: Scalar  # it makes a momentum decay by exp(-x G)
-    carried: Integral | Quadrature  # the integral of a decaying momentum
-    responded: Integral | Quadrature  # the momentum left by a constant force
+    change: Array  # of a momentum by decay
+    carried: Array  # the integral of a decaying momentum
+    responded: Array  # the momentum left by a constant force
 
 
 class AbstractLogScale(eqx.Module):
@@ -68,10 +57,11 @@ class AbstractLogScale(eqx.Module):
     def rate(self, t: Time) -> Inexact[Array, "..."]:
         r"""The rate $\eta'(t)$."""
 
-    def exponents(self, t: Time, h: Time, order: int) -> Exponents:
-        """What this friction does from `t` to `t + h`, by a quadrature of at least the
-        given order in `h` where it is not known in closed form."""
-        return by_quadrature(self, t, h, order)
+    def effect(self, rate: Array, t: Time, h: Time, order: int) -> Effect:
+        """What friction of this log scale times a rate does from `t` to `t + h`, by a
+        quadrature of at least the given order in `h` where it is not known in closed
+        form."""
+        return by_quadrature([(self, rate)], t, h, order)
 
     def is_singular(self, t: Time) -> Bool[Array, ""] | None:
         """Whether the rate is infinite at `t`; `None` if it never is."""
@@ -83,15 +73,23 @@ class AbstractLogScale(eqx.Module):
         return 0.0
 
 
-def by_quadrature(law: AbstractLogScale, t: Time, h: Time, order: int) -> Exponents:
+Terms = Sequence[tuple[AbstractLogScale, Array]]
+
+
+def increment(terms: Terms, t: Time, h: Time) -> Array:
+    """The difference of a sum of log scales with factors."""
+    each = [cast_to(rate, x := law.increment(t, h)) * x for law, rate in terms]
+    return functools.reduce(jnp.add, each)
+
+
+def by_quadrature(terms: Terms, t: Time, h: Time, order: int) -> Effect:
+    """What friction of several log scales with factors does from `t` to `t + h`."""
     nodes, weights = gauss_legendre(h, order)
-    carried = jax.vmap(lambda s: law.increment(t, s))(nodes)
-    responded = jax.vmap(lambda s: law.increment(t + s, h - s))(nodes)
-    return Exponents(
-        law.increment(t, h),
-        Quadrature(weights, carried),
-        Quadrature(weights, responded),
-    )
+    decayed = jax.vmap(lambda s: jnp.exp(-increment(terms, t, s)))(nodes)
+    left = jax.vmap(lambda s: jnp.exp(-increment(terms, t + s, h - s)))(nodes)
+    weights = jnp.expand_dims(weights, range(1, left.ndim))
+    integrals = (jnp.sum(weights * x, axis=0) for x in (decayed, left))
+    return Effect(expm1(-increment(terms, t, h)), *integrals)
 
 
 class Linear(AbstractLogScale):
@@ -109,10 +107,10 @@ class Linear(AbstractLogScale):
     def rate(self, t: Time) -> Scalar:
         return jnp.ones_like(as_time(t))
 
-    def exponents(self, t: Time, h: Time, order: int) -> Exponents:
-        h = as_time(h)
-        integral = Integral(jnp.ones_like(h), h, 0.0)
-        return Exponents(h, integral, integral)
+    def effect(self, rate: Array, t: Time, h: Time, order: int) -> Effect:
+        x = cast_to(rate, h := as_time(h)) * h
+        integral = h * expm1_ratio(-x)
+        return Effect(expm1(-x), integral, integral)
 
 
 # Of the singularity: the momentum left there is less than rounding.
@@ -146,13 +144,15 @@ class Logarithm(AbstractLogScale):
         singular, since = self._since(t)
         return jnp.where(singular, jnp.inf, 1 / since)
 
-    def exponents(self, t: Time, h: Time, order: int) -> Exponents:
-        # With the time tau since the singularity, at the start and at the end,
-        # exp(-x G) is (tau / tau_end)^G.
+    def effect(self, rate: Array, t: Time, h: Time, order: int) -> Effect:
+        # With the time tau since the singularity, at the start and at the end, a
+        # momentum decays by (tau / tau_end)^rate.
         singular, since = self._since(t)
         start = jnp.where(singular, 0, since)
-        x, h = self.increment(t, h), as_time(h)
-        return Exponents(x, Integral(start, x, -1.0), Integral(start + h, x, 1.0))
+        x, h, rate = self.increment(t, h), as_time(h), cast_to(rate, since)
+        carried = start * x * expm1_ratio((1 - rate) * x)
+        responded = (start + h) * x * expm1_ratio(-(1 + rate) * x)
+        return Effect(expm1(-rate * x), carried, responded)
 
     def is_singular(self, t: Time) -> Bool[Array, ""]:
         return jnp.any(self._since(t)[0])

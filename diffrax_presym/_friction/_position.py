@@ -4,8 +4,7 @@ from jaxtyping import PyTree
 
 from .._forms import multiply
 from .._misc import Time, tree_scale
-from ._base import AbstractFriction, Local, Mechanics, Parts
-from ._rates import DAMPING
+from ._base import AbstractFriction, DAMPING, Local, Mechanics, Parts
 
 
 class PositionDamping(AbstractFriction):

@@ -29,11 +29,12 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     states are not finite fails.
 
     For every solver of this package, with `diffrax.ConstantStepSize`,
-    [`diffrax_presym.StepsBetween`][] or `diffrax.StepTo`, and any `SaveAt`. With a
+    [`diffrax_presym.StepsBetween`][] or `diffrax.StepTo`, and any `SaveAt` but dense
+    output. With a
     constant step the steps are all equal: as few as are not longer than `dt0`. (Diffrax
     takes the first of the length `dt0`, if that does not divide the time of the solve;
-    and its times may differ in the last bit.) Events and adaptive steps are errors; use
-    `diffrax.RecursiveCheckpointAdjoint` for these.
+    and its times may differ in the last bit.) Events, dense output and adaptive
+    steps are errors; use `diffrax.RecursiveCheckpointAdjoint` for these.
 
     The gradient is that of the discrete solution ("discretise, then optimise"), with
     respect to `y0`, `args`, the system, and everything that a function of these or of
@@ -90,7 +91,8 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         del throw, passed_solver_state
         y, carry, made_jump = private.start_of(init_state)
         system = bind(terms, args, y)
-        _check(solver, stepsize_controller, event, passed_controller_state)
+        unsupported = event, saveat.dense, passed_controller_state
+        _check(solver, stepsize_controller, *unsupported)
         scheme = solver.scheme(system)
         if self.gradient == "reversal" and not scheme.is_invertible:
             raise ValueError(
@@ -116,7 +118,6 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
             list(map(without_fn, subs)),
             solver,
             max_steps,
-            private.dense_buffers(init_state)[1],
             progress_meter,
             private.meter_of(init_state),
         )
@@ -144,7 +145,7 @@ exceeds `tol`.
 """
 
 
-def _check(solver, controller, event, passed_controller_state) -> None:
+def _check(solver, controller, event, dense, passed_controller_state) -> None:
     what, instead = None, "`diffrax.RecursiveCheckpointAdjoint()`"
     # An instance of `HalfSolver` is one of the class of the solver in it.
     known = isinstance(solver, AbstractPresymplecticSolver)
@@ -157,6 +158,8 @@ def _check(solver, controller, event, passed_controller_state) -> None:
         )
     elif event is not None:
         what = "events"
+    elif dense:
+        what = "dense output"
     elif passed_controller_state:
         what = "a `controller_state`"
     if what is not None:
@@ -175,13 +178,9 @@ def _final_state(problem: Problem, adjoint: FixedStepAdjoint, init_state, struct
         _solve((problem, buffers), adjoint), eqx.is_inexact_array
     )
     # To JAX all outputs of a custom rule have derivatives, even integers.
-    end, saved, dense, n, result, meter = eqx.combine(
+    end, saved, n, result, meter = eqx.combine(
         out, eqxi.nondifferentiable_backward(counts)
     )
-    if dense is not None:
-        dense_ts, _ = private.dense_buffers(init_state)
-        index = jnp.arange(len(dense_ts))
-        dense = jnp.where(index <= n, problem.steps.time(index), dense_ts), dense
     return private.final_state(
         private.without_start(init_state),
         structure,
@@ -192,7 +191,6 @@ def _final_state(problem: Problem, adjoint: FixedStepAdjoint, init_state, struct
         result=result,
         meter=meter,
         saved=saved,
-        dense=dense,
     )
 
 
@@ -209,7 +207,7 @@ def _outputs(problem: Problem, buffers, out):
         saved_rows(problem, i, buffer, rows, progress)
         for i, (buffer, rows) in enumerate(zip(buffers, values, strict=True))
     ]
-    return progress.point, saved, progress.dense, progress.n, result, progress.meter
+    return progress.point, saved, progress.n, result, progress.meter
 
 
 @_solve.def_fwd
@@ -230,7 +228,7 @@ def _solve_fwd(perturbed, inputs, adjoint: FixedStepAdjoint):
 @_solve.def_bwd
 def _solve_bwd(trace, bars, perturbed, inputs, adjoint: FixedStepAdjoint):
     (problem, buffers), moved = inputs, perturbed[0]
-    (_, carry_bar), saved_bars, dense_bar, *_ = bars
+    (_, carry_bar), saved_bars, *_ = bars
     zeros = lambda like, bar: jtu.tree_map(
         lambda x, b: jnp.zeros_like(x) if b is None else b,
         *(eqx.filter(like, eqx.is_inexact_array), bar),
@@ -239,10 +237,8 @@ def _solve_bwd(trace, bars, perturbed, inputs, adjoint: FixedStepAdjoint):
     saved_bars = [
         zeros(ys, bar[1]) for (_, ys), bar in zip(buffers, saved_bars, strict=True)
     ]
-    if problem.dense is not None:
-        dense_bar = zeros(problem.dense, dense_bar)
     wanted = moved.system, moved.fns
-    backward = Backward(problem, trace, wanted, (saved_bars, carry_bar, dense_bar))
+    backward = Backward(problem, trace, wanted, (saved_bars, carry_bar))
     at = pull_back(adjoint, backward)
     none = lambda tree: jtu.tree_map(lambda _: None, tree)
     where = lambda x: (x.system, x.fns, x.start)

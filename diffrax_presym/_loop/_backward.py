@@ -12,8 +12,8 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Int, PyTree
 
 from .._misc import tree_sum, tree_zeros
-from .._scheme._base import advance, dense_info, Point, Scheme
-from .._scheme._engine import prepare, Span, undo, vjp, vjp_step
+from .._scheme._base import advance, Point, Scheme
+from .._scheme._engine import prepare, Span, vjp, vjp_step
 from ._run import end_is_separate, Problem, Trace
 
 
@@ -42,13 +42,12 @@ class Backward(eqx.Module):
     wanted: PyTree
     saved_bars: list[PyTree]  # the cotangents of what each output saved
     carry_bar: PyTree
-    dense_bar: PyTree
     shared: PyTree  # what all steps share, and their inverses
     shared_back: PyTree
 
     def __init__(self, problem: Problem, trace: Trace, wanted, bars):
         self.problem, self.trace, self.wanted = problem, trace, wanted
-        self.saved_bars, self.carry_bar, self.dense_bar = bars
+        self.saved_bars, self.carry_bar = bars
         self.shared = problem.prepare(problem.system)
         self.shared_back = problem.prepare(problem.system, backward=True)
 
@@ -168,11 +167,6 @@ class Backward(eqx.Module):
         back = self.shared_back
         if start is None and not once:
             back = prepare(moves, system, span, backward=True)
-        start_bar = tree_zeros(at.bar)
-        if self.dense_bar is not None:
-            if start is None:
-                start = undo(moves, system, span, back, at.point)
-            at, start_bar = self._pull_dense(at, n, span, start)
         if start is None:
             args = system, wanted, span, (data, back), at.point, at.bar
             start, more, prepared, bar = vjp_step(moves, *args)
@@ -188,7 +182,6 @@ class Backward(eqx.Module):
         else:
             fn = lambda system: prepare(moves, system, span)
             gradient = tree_sum(gradient, self._pull_prepared(fn, prepared))
-        bar = tree_sum(bar, start_bar)
         return Position(n, start, bar, gradient, shared, at.left)
 
     def _pull_prepared(self, fn: Callable, bar: PyTree) -> PyTree:
@@ -249,16 +242,3 @@ class Backward(eqx.Module):
 
         bars = jtu.tree_map(bar, self.saved_bars[i])
         return jax.vjp(outputs, moved, self.trace.starts[i])[1](bars)
-
-    def _pull_dense(self, at: Position, n: Array, span: Span, start: Point):
-        """Pull back the data of dense output, to both ends of a step."""
-        moved, fixed = self._parameters
-
-        def info(moved, start, end):
-            system, _ = eqx.combine(moved, fixed)
-            args = self.problem.solver, self.scheme, system, span
-            return dense_info(*args, start, end)
-
-        bar = jtu.tree_map(lambda x: x[n], self.dense_bar)
-        more, start_bar, end_bar = jax.vjp(info, moved, start, at.point)[1](bar)
-        return at.add(more, end_bar), start_bar

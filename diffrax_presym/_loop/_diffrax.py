@@ -28,11 +28,6 @@ def saved_buffers(state, structure) -> list[tuple[Array, PyTree]]:
     return [(save.ts, save.ys) for save in structure.flatten_up_to(state.save_state)]
 
 
-def dense_buffers(state) -> tuple[Any, PyTree]:
-    """The times and the data of dense output to fill; `None` without dense output."""
-    return state.dense_ts, state.dense_infos
-
-
 def meter_of(state) -> PyTree:
     return state.progress_meter_state
 
@@ -48,7 +43,6 @@ def final_state(
     result: dfx.RESULTS,
     meter: PyTree,
     saved: list[tuple[Array, PyTree, Array, Array]],
-    dense: tuple[Array, PyTree] | None,
 ):
     """Diffrax's state at the end of a solve of so many `steps`, from that at its start.
 
@@ -81,8 +75,6 @@ def final_state(
         "controller_state": controller,
         "made_jump": False,
     }
-    if dense is not None:
-        new |= dict(dense_ts=dense[0], dense_infos=dense[1], dense_save_index=steps)
     where = lambda x: [getattr(x, name) for name in new]
     return eqx.tree_at(where, state, list(new.values()), is_leaf=lambda x: x is None)
 

@@ -18,12 +18,11 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Int, PyTree
 
-from .._misc import all_finite, cast_to
+from .._misc import all_finite, cast_to, tree_where
 from .._scheme._base import (
     AbstractPresymplecticSolver,
     advance,
     between,
-    dense_info,
     Point,
     Scheme,
 )
@@ -53,8 +52,6 @@ class Problem(eqx.Module):
     subs: list[dfx.SubSaveAt]  # without their functions
     solver: AbstractPresymplecticSolver
     max_steps: int | None = eqx.field(static=True)
-    # Where dense output and the progress meter are, if any.
-    dense: PyTree
     progress_meter: dfx.AbstractProgressMeter
     meter: PyTree
 
@@ -98,7 +95,12 @@ class Problem(eqx.Module):
         t = jnp.where(inside, t, jnp.where(end > begin, end, begin + 1))
         times = system.time(begin), system.time(t)
         shorter = lambda: between(self.scheme, system, times[0], start, times[1])
-        return lax.cond(inside, shorter, lambda: system.values(start[0]))
+        y = system.values(start[0])
+        if self.at_once:
+            # Under `jax.vmap` a `lax.cond` computes both, and copies what both share,
+            # such as matrices of friction, for each row.
+            return tree_where(inside, shorter(), y)
+        return lax.cond(inside, shorter, lambda: y)
 
     def output(self, i: int, parameters: Parameters, j: Array, start: Point) -> PyTree:
         """What output `i` saves in row `j`, from the state at the start of its step."""
@@ -136,7 +138,6 @@ class Progress(eqx.Module):
     point: Point
     result: dfx.RESULTS | None  # `None` if no step can fail
     meter: PyTree
-    dense: PyTree
 
 
 class Track(eqx.Module):
@@ -221,15 +222,11 @@ def _walk(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
 
     def one_step(progress: Progress) -> Progress:
         n, start = progress.n, progress.point
-        span, infos = steps.span(system, n), progress.dense
-        end, result = advance(scheme, system, span, start, shared)
-        if infos is not None:
-            info = dense_info(problem.solver, scheme, system, span, start, end)
-            infos = _put(infos, n, info)
+        end, result = advance(scheme, system, steps.span(system, n), start, shared)
         done = (steps.time(n + 1) - steps.t0) / (steps.t1 - steps.t0)
-        return Progress(n + 1, end, result, meter.step(progress.meter, done), infos)
+        return Progress(n + 1, end, result, meter.step(progress.meter, done))
 
-    start = Progress(jnp.asarray(0), problem.start, None, problem.meter, problem.dense)
+    start = Progress(jnp.asarray(0), problem.start, None, problem.meter)
     # Traced once, for all of its uses.
     traced = eqx.filter_closure_convert(one_step, start)
     can_fail = eqx.filter_eval_shape(traced, start).result is not None

@@ -3,16 +3,10 @@ from ._compensated import Compensated as Compensated
 from ._composition import (
     Composition as Composition,
     PresymplecticYoshida4 as PresymplecticYoshida4,
-    SofroniouSpaletta6 as SofroniouSpaletta6,
-    SofroniouSpaletta8 as SofroniouSpaletta8,
-    SofroniouSpaletta10 as SofroniouSpaletta10,
+    SofroniouSpaletta as SofroniouSpaletta,
     Substeps as Substeps,
     Suzuki4 as Suzuki4,
     SuzukiYoshida as SuzukiYoshida,
-)
-from ._copies import (
-    PresymplecticCoupled as PresymplecticCoupled,
-    PresymplecticTao as PresymplecticTao,
 )
 from ._frozen import (
     PresymplecticEuler as PresymplecticEuler,
@@ -32,3 +26,4 @@ from ._splitting import (
     TunedRKN6 as TunedRKN6,
 )
 from ._tableaus import SplittingTableau as SplittingTableau
+from ._tao import PresymplecticTao as PresymplecticTao

@@ -14,7 +14,6 @@ from .._misc import all_finite, cast_to, State, tree_scale
 from .._system._base import check_state
 from .._system._bound import bind, NONFINITE, System, unwrap
 from ._engine import first_failure, forward, Moves, prepare, Result, Span
-from ._estimate import no_error_estimate
 
 
 # Points within a step that dense output uses, from the order up to which they suffice.
@@ -108,7 +107,7 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver):
         )
         info = dense_info(self, scheme, system, span, start, end)
         result = first_failure(result, finite)
-        return end[0], no_error_estimate(end[0]), info, end[1], result
+        return end[0], None, info, end[1], result
 
     def func(self, terms, t0, y0, args):
         return terms.vf(t0, y0, args)

@@ -1,15 +1,12 @@
-"""Tables of Gauss collocation, to the last digit of a double."""
+"""Tables of Gauss collocation."""
 
 import functools
-from collections.abc import Callable
-from decimal import Decimal, localcontext
 from typing import Any, NamedTuple
 
 import numpy as np
 
 
 MAX_STAGES = 8
-_DIGITS = 60
 
 
 class GaussTable(NamedTuple):
@@ -39,61 +36,15 @@ def legendre(count: int, x: Any) -> list:
 
 @functools.cache
 def gauss_table(stages: int) -> GaussTable:
-    """The table of so many stages.
-
-    Computed in 60 decimal digits and rounded once. `numpy.polynomial.legendre.leggauss`
-    is right to a few units in the last place.
-    """
-    with localcontext() as context:
-        context.prec = _DIGITS
-        points = [_root(stages, guess) for guess in _guesses(stages)]
-        # Exactly antisymmetric, the middle one exactly zero.
-        points = [(a - b) / 2 for a, b in zip(points, points[::-1], strict=True)]
-        values = [legendre(stages + 1, x) for x in points]
-        slopes = [
-            stages * (x * p[stages] - p[stages - 1]) / (x * x - 1)
-            for x, p in zip(points, values, strict=True)
-        ]
-        weights = [
-            1 / ((1 - x * x) * s * s) for x, s in zip(points, slopes, strict=True)
-        ]
-        project = [[(2 * k + 1) * p[k] for p in values] for k in range(stages)]
-        mu = _matrix(
-            lambda i, j: (
-                (1 + points[i]) / 2
-                + sum(
-                    values[j][k] * (values[i][k + 1] - values[i][k - 1]) / 2
-                    for k in range(1, stages)
-                )
-            ),
-            stages,
-        )
-        nodes = _round([(1 + x) / 2 for x in points])
-        rounded = _round(mu)
-        # The larger of two that add up to one is rounded, the other is exact.
-        lower = np.tril(rounded, -1)
-        upper = np.triu(1 - rounded.T, 1)
-        exact = lower + upper + np.eye(stages) / 2
-        return GaussTable(nodes, _round(weights), exact, _round(project))
-
-
-def _guesses(stages: int) -> list[Decimal]:
-    points, _ = np.polynomial.legendre.leggauss(stages)
-    return [Decimal(float(x)) for x in points]
-
-
-def _root(stages: int, x: Decimal) -> Decimal:
-    # Each iteration doubles the digits, of which there are 15 to begin with.
-    for _ in range(3):
-        p = legendre(stages + 1, x)
-        x -= p[stages] * (x * x - 1) / (stages * (x * p[stages] - p[stages - 1]))
-    return x
-
-
-def _matrix(entry: Callable, size: int) -> list[list[Decimal]]:
-    return [[entry(i, j) for j in range(size)] for i in range(size)]
-
-
-def _round(x: Any) -> np.ndarray:
-    # From decimal to the nearest double.
-    return np.vectorize(float, otypes=[float])(np.array(x, dtype=object))
+    """The table of so many stages, to a few units in the last place."""
+    x, weights = np.polynomial.legendre.leggauss(stages)
+    values = np.array(legendre(stages + 1, x))
+    # The integrals of P_k from 0 to the nodes are differences of its neighbours.
+    integrals = (values[2:] - values[:-2]) / 2
+    mu = (1 + x[:, None]) / 2 + integrals.T @ values[1:-1]
+    # The larger of two that add up to one is rounded, the other is exact.
+    upper = np.triu(1 - mu.T, 1)
+    project = (2 * np.arange(stages)[:, None] + 1) * values[:-1]
+    return GaussTable(
+        (1 + x) / 2, weights / 2, np.tril(mu, -1) + upper + np.eye(stages) / 2, project
+    )

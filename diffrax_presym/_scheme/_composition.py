@@ -1,62 +1,22 @@
+"""Compositions: several steps of a scheme as one, each a list of weights."""
+
 import math
+from collections.abc import Sequence
 from decimal import Decimal, localcontext
-from typing import ClassVar, Literal, TYPE_CHECKING
+from typing import Literal
 
 import equinox as eqx
 import optimistix as optx
 
-from .._compositions import stages
+from .._compositions import SOFRONIOU_SPALETTA, stages, SUZUKI_4
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, check_base, Scheme
 from ._engine import Stages
 from ._frozen import PresymplecticLeapfrog
-from ._tableaus import (
-    CompositionTableau,
-    SOFRONIOU_SPALETTA_6,
-    SOFRONIOU_SPALETTA_8,
-    SOFRONIOU_SPALETTA_10,
-    SUZUKI_4,
-)
 
 
-if TYPE_CHECKING:
-    # To a type checker an abstract field is any kind of field.
-    from typing import ClassVar as AbstractVar
-else:
-    from equinox import AbstractVar
-
-
-Weights = tuple[float, ...]
-
-
-class AbstractComposition(AbstractPresymplecticSolver):
-    """Several steps of a base scheme as one, with weights that sum to one."""
-
-    base: AbstractVar[AbstractPresymplecticSolver]
-    weights: AbstractVar[Weights]
-
-    def __check_init__(self):
-        check_base(self.base)
-        if len(set(self.weights)) > 1 and not self.base.is_symmetric:
-            raise ValueError(
-                "Compositions need a symmetric base, which "
-                f"`{type(self.base).__name__}` is not. Compose "
-                "`PresymplecticLeapfrog()` instead."
-            )
-
-    @property
-    def is_symmetric(self) -> bool:
-        return self.base.is_symmetric and self.weights == self.weights[::-1]
-
-    def scheme(self, system: System) -> Scheme:
-        scheme = self.base.scheme(system)
-        if len(set(self.weights)) > 1 and scheme.not_composable is not None:
-            raise ValueError(scheme.not_composable)
-        return scheme._replace(moves=Stages([scheme.moves], stages(self.weights)))
-
-
-class Composition(AbstractComposition):
-    """A composition of a symmetric scheme with itself, given by weights.
+class Composition(AbstractPresymplecticSolver):
+    """Several steps of a scheme as one, given by weights.
 
     Order as given. The cost per step is that of the base times the number of weights.
     Uses Hermite interpolation for dense/ts output, at the cost of up to three more
@@ -64,14 +24,14 @@ class Composition(AbstractComposition):
     """
 
     base: AbstractPresymplecticSolver
-    weights: Weights = eqx.field(static=True)
-    composed_order: int | None = eqx.field(static=True)
+    weights: tuple[float, ...] = eqx.field(static=True)
+    composed_order: int = eqx.field(static=True)
 
-    def __init__(self, base, weights, order: int | None = None):
+    def __init__(self, base, weights: Sequence[float], order: int | None = None):
         """**Arguments:**
 
-        - `base`: a symmetric presymplectic solver, for example
-            [`diffrax_presym.PresymplecticLeapfrog`][].
+        - `base`: a presymplectic solver, symmetric unless all weights are equal; for
+            example [`diffrax_presym.PresymplecticLeapfrog`][].
         - `weights`: the lengths of the stages in units of the step: real numbers of any
             sign that sum to one.
         - `order`: the order of the composition, which is not computed from the weights.
@@ -81,27 +41,49 @@ class Composition(AbstractComposition):
 
         `ValueError` if the weights do not sum to one, or the base is not symmetric.
         """
-        weights = tuple(float(w) for w in weights)
-        total = math.fsum(weights)
+        check_base(base)
+        self.base = base
+        self.weights = tuple(float(w) for w in weights)
+        self.composed_order = 1 if order is None else order
+        total = math.fsum(self.weights)
         if not abs(total - 1) < 1e-12:
             raise ValueError(
                 f"`weights` must sum to one, but sum to {total}. To scale them, divide "
                 "by their sum."
             )
-        if order is not None and (not isinstance(order, int) or order < 1):
+        if type(self.composed_order) is not int or self.composed_order < 1:
             raise ValueError(
                 "`Composition(..., order=...)` must be a positive integer, or omitted "
                 f"for the order of the base, but got {order!r}."
             )
-        self.base = base
-        self.weights = weights
-        self.composed_order = order
+        if len(set(self.weights)) > 1 and not base.is_symmetric:
+            raise ValueError(
+                "Compositions need a symmetric base, which "
+                f"`{type(base).__name__}` is not. Compose `PresymplecticLeapfrog()` "
+                "instead."
+            )
+
+    @property
+    def is_symmetric(self) -> bool:
+        return self.base.is_symmetric and self.weights == self.weights[::-1]
 
     def order(self, terms) -> int:
-        return max(self.composed_order or 1, self.base.order(terms))
+        return max(self.composed_order, self.base.order(terms))
+
+    def scheme(self, system: System) -> Scheme:
+        scheme = self.base.scheme(system)
+        if len(set(self.weights)) > 1 and scheme.not_composable is not None:
+            raise ValueError(scheme.not_composable)
+        return scheme._replace(moves=Stages([scheme.moves], stages(self.weights)))
 
 
-class SuzukiYoshida(AbstractComposition):
+def _leapfrog_if_none(base) -> AbstractPresymplecticSolver:
+    return PresymplecticLeapfrog() if base is None else base
+
+
+def SuzukiYoshida(
+    order: int, base: AbstractPresymplecticSolver | None = None
+) -> Composition:
     r"""The triple jump of Suzuki and Yoshida, to any even order.
 
     Order as given; $3^{r/2 - 1}$ force evaluations per step at order $r$. Symmetric.
@@ -113,6 +95,21 @@ class SuzukiYoshida(AbstractComposition):
     8. A system that is singular at the initial time, such as with
     [`diffrax_presym.LogDamping`][] without a shift, is then evaluated outside its
     domain.
+
+    **Arguments:**
+
+    - `order`: the order, a positive even number. At 2 it is the base itself.
+    - `base`: a symmetric presymplectic solver of second order. Defaults to
+        [`diffrax_presym.PresymplecticLeapfrog`][].
+
+    **Returns:**
+
+    A [`diffrax_presym.Composition`][].
+
+    **Raises:**
+
+    `ValueError` if the order is not a positive even number, or the base is not
+    symmetric.
 
     ??? cite "Reference"
 
@@ -141,41 +138,19 @@ class SuzukiYoshida(AbstractComposition):
         }
         ```
     """
-
-    base: AbstractPresymplecticSolver
-    weights: Weights = eqx.field(static=True)
-    composed_order: int = eqx.field(static=True)
-
-    def __init__(
-        self,
-        order: int,
-        base: AbstractPresymplecticSolver = PresymplecticLeapfrog(),  # noqa: B008
-    ):
-        """**Arguments:**
-
-        - `order`: the order, a positive even number. At 2 it is the base itself.
-        - `base`: a symmetric presymplectic solver of second order. Defaults to
-            [`diffrax_presym.PresymplecticLeapfrog`][].
-
-        **Raises:**
-
-        `ValueError` if the order is not a positive even number, or the base is not
-        symmetric.
-        """
-        if not isinstance(order, int) or order < 2 or order % 2 != 0:
-            raise ValueError(
-                "`SuzukiYoshida(order)` needs a positive even integer, for example "
-                f"`SuzukiYoshida(4)`, but got {order!r}."
-            )
-        self.base = base
-        self.weights = triple_jump(order)
-        self.composed_order = order
-
-    def order(self, terms) -> int:
-        return max(self.composed_order, self.base.order(terms))
+    if not isinstance(order, int) or order < 2 or order % 2 != 0:
+        raise ValueError(
+            "`SuzukiYoshida(order)` needs a positive even integer, for example "
+            f"`SuzukiYoshida(4)`, but got {order!r}."
+        )
+    return Composition(_leapfrog_if_none(base), triple_jump(order), order)
 
 
-class PresymplecticYoshida4(AbstractComposition):
+def PresymplecticYoshida4(
+    first: Literal["momentum", "position"] = "momentum",
+    root_finder: optx.AbstractRootFinder | None = None,
+    root_find_max_steps: int = 32,
+) -> Composition:
     """The fourth-order method of Creutz and Gocksch, Forest and Ruth, Suzuki, Yoshida.
 
     4th order and symmetric. Three force evaluations per step. Uses 3rd order Hermite
@@ -183,6 +158,14 @@ class PresymplecticYoshida4(AbstractComposition):
 
     The fourth-order scheme of the paper, the same as
     [`diffrax_presym.SuzukiYoshida`][]`(4)`; see there for its limitations.
+
+    **Arguments:**
+
+    As [`diffrax_presym.PresymplecticLeapfrog`][].
+
+    **Returns:**
+
+    A [`diffrax_presym.Composition`][].
 
     ??? cite "Reference"
 
@@ -200,80 +183,63 @@ class PresymplecticYoshida4(AbstractComposition):
         }
         ```
     """
-
-    base: AbstractPresymplecticSolver
-    weights: Weights = eqx.field(static=True)
-
-    def __init__(
-        self,
-        first: Literal["momentum", "position"] = "momentum",
-        root_finder: optx.AbstractRootFinder | None = None,
-        root_find_max_steps: int = 32,
-    ):
-        self.base = PresymplecticLeapfrog(first, root_finder, root_find_max_steps)
-        self.weights = triple_jump(4)
-
-    def order(self, terms) -> int:
-        return 4
+    base = PresymplecticLeapfrog(first, root_finder, root_find_max_steps)
+    return SuzukiYoshida(4, base)
 
 
-PresymplecticYoshida4.__init__.__doc__ = PresymplecticLeapfrog.__init__.__doc__
-
-
-class AbstractTabulated(AbstractComposition):
-    """A composition with known weights."""
-
-    tableau: AbstractVar[CompositionTableau]
-
-    @property
-    def weights(self) -> Weights:
-        return self.tableau.weights
-
-    def order(self, terms) -> int:
-        return max(self.tableau.order, self.base.order(terms))
-
-
-_BASE = """**Arguments:**
-
-- `base`: a symmetric presymplectic solver of second order. Defaults to
-    [`diffrax_presym.PresymplecticLeapfrog`][].
-
-**Raises:**
-
-`ValueError` if the base is not symmetric.
-"""
-
-
-class Suzuki4(AbstractTabulated):
+def Suzuki4(base: AbstractPresymplecticSolver | None = None) -> Composition:
     """Suzuki's fourth-order composition of five stages.
 
-    4th order, 5 stages, symmetric if its base is: with the default base 5 force
-    evaluations per step. Uses Hermite interpolation for dense/ts output, at the cost
-    of another step.
+    4th order, 5 stages, symmetric: with the default base 5 force evaluations per step.
+    Uses Hermite interpolation for dense/ts output, at the cost of another step.
 
     Its error is several times smaller than that of the triple jump
     ([`diffrax_presym.PresymplecticYoshida4`][]) at equal cost, and its stages stay
     within the step.
 
     Source: Suzuki (1990), see [`diffrax_presym.SuzukiYoshida`][].
+
+    **Arguments:**
+
+    - `base`: a symmetric presymplectic solver of second order. Defaults to
+        [`diffrax_presym.PresymplecticLeapfrog`][].
+
+    **Returns:**
+
+    A [`diffrax_presym.Composition`][].
+
+    **Raises:**
+
+    `ValueError` if the base is not symmetric.
     """
-
-    base: AbstractPresymplecticSolver = PresymplecticLeapfrog()
-    tableau: ClassVar[CompositionTableau] = SUZUKI_4
+    return Composition(_leapfrog_if_none(base), SUZUKI_4, 4)
 
 
-Suzuki4.__init__.__doc__ = _BASE
+def SofroniouSpaletta(
+    order: int = 6, base: AbstractPresymplecticSolver | None = None
+) -> Composition:
+    """Sofroniou and Spaletta's compositions of 13, 21 and 35 stages.
 
+    6th, 8th or 10th order, symmetric: with the default base 13, 21 or 35 force
+    evaluations per step. Uses Hermite interpolation for dense/ts output, at the cost of
+    three more steps.
 
-class SofroniouSpaletta6(AbstractTabulated):
-    """Sofroniou and Spaletta's sixth-order composition of thirteen stages.
-
-    6th order, 13 stages, symmetric if its base is: with the default base 13 force
-    evaluations per step. Uses Hermite interpolation for dense/ts output, at the cost
-    of three more steps.
-
-    The recommended composition of sixth order, for any base. If the kinetic part has a
+    The recommended compositions of high order, for any base. If the kinetic part has a
     known flow, a [`diffrax_presym.Splitting`][] is more accurate at equal cost.
+
+    **Arguments:**
+
+    - `order`: 6, 8 or 10. Defaults to 6. Order 10 is for errors close to rounding.
+    - `base`: a symmetric presymplectic solver of second order. Defaults to
+        [`diffrax_presym.PresymplecticLeapfrog`][].
+
+    **Returns:**
+
+    A [`diffrax_presym.Composition`][].
+
+    **Raises:**
+
+    `ValueError` if the order is not one of these, or the base is not symmetric.
 
     ??? cite "Reference"
 
@@ -290,53 +256,15 @@ class SofroniouSpaletta6(AbstractTabulated):
         }
         ```
     """
-
-    base: AbstractPresymplecticSolver = PresymplecticLeapfrog()
-    tableau: ClassVar[CompositionTableau] = SOFRONIOU_SPALETTA_6
-
-
-SofroniouSpaletta6.__init__.__doc__ = _BASE
-
-
-class SofroniouSpaletta8(AbstractTabulated):
-    """Sofroniou and Spaletta's eighth-order composition of twenty-one stages.
-
-    8th order, 21 stages, symmetric if its base is: with the default base 21 force
-    evaluations per step. Uses Hermite interpolation for dense/ts output, at the cost
-    of three more steps.
-
-    The recommended composition of eighth order, for any base.
-
-    Source: Sofroniou and Spaletta (2005), see [`diffrax_presym.SofroniouSpaletta6`][].
-    """
-
-    base: AbstractPresymplecticSolver = PresymplecticLeapfrog()
-    tableau: ClassVar[CompositionTableau] = SOFRONIOU_SPALETTA_8
+    if order not in SOFRONIOU_SPALETTA:
+        raise ValueError(
+            f"`SofroniouSpaletta(order)` must be 6, 8 or 10, but got {order!r}. At "
+            "order 4 use `Suzuki4()`."
+        )
+    return Composition(_leapfrog_if_none(base), SOFRONIOU_SPALETTA[order], order)
 
 
-SofroniouSpaletta8.__init__.__doc__ = _BASE
-
-
-class SofroniouSpaletta10(AbstractTabulated):
-    """Sofroniou and Spaletta's tenth-order composition of thirty-five stages.
-
-    10th order, 35 stages, symmetric if its base is: with the default base 35 force
-    evaluations per step. Uses Hermite interpolation for dense/ts output, at the cost
-    of three more steps.
-
-    For errors close to rounding, which lower orders do not reach with fewer stages.
-
-    Source: Sofroniou and Spaletta (2005), see [`diffrax_presym.SofroniouSpaletta6`][].
-    """
-
-    base: AbstractPresymplecticSolver = PresymplecticLeapfrog()
-    tableau: ClassVar[CompositionTableau] = SOFRONIOU_SPALETTA_10
-
-
-SofroniouSpaletta10.__init__.__doc__ = _BASE
-
-
-class Substeps(AbstractComposition):
+def Substeps(base: AbstractPresymplecticSolver, n: int) -> Composition:
     """Several equal steps of a scheme as one step of the solve.
 
     Order and accuracy at the ends of steps are those of the base; the cost per step is
@@ -345,35 +273,30 @@ class Substeps(AbstractComposition):
 
     What `diffeqsolve` does once per step (`SaveAt(ts=...)`, events, `SaveAt(steps=...)`
     of every `n`-th step, progress meters) is done `n` times less often.
+
+    **Arguments:**
+
+    - `base`: any presymplectic solver.
+    - `n`: the number of steps of the base in one step, a positive integer. The `dt0` of
+        the solve is `n` times the step of the base.
+
+    **Returns:**
+
+    A [`diffrax_presym.Composition`][].
+
+    **Raises:**
+
+    `ValueError` if `n` is not a positive integer.
     """
-
-    base: AbstractPresymplecticSolver
-    weights: Weights = eqx.field(static=True)
-
-    def __init__(self, base: AbstractPresymplecticSolver, n: int):
-        """**Arguments:**
-
-        - `base`: any presymplectic solver.
-        - `n`: the number of steps of the base in one step, a positive integer. The
-            `dt0` of the solve is `n` times the step of the base.
-
-        **Raises:**
-
-        `ValueError` if `n` is not a positive integer.
-        """
-        if not isinstance(n, int) or n < 1:
-            raise ValueError(
-                "`Substeps(base, n)` needs a positive Python integer `n`, for example "
-                f"`Substeps(PresymplecticLeapfrog(), 10)`, but got {n!r}."
-            )
-        self.base = base
-        self.weights = (1 / n,) * n
-
-    def order(self, terms) -> int:
-        return self.base.order(terms)
+    if not isinstance(n, int) or n < 1:
+        raise ValueError(
+            "`Substeps(base, n)` needs a positive Python integer `n`, for example "
+            f"`Substeps(PresymplecticLeapfrog(), 10)`, but got {n!r}."
+        )
+    return Composition(base, (1 / n,) * n)
 
 
-def triple_jump(order: int) -> Weights:
+def triple_jump(order: int) -> tuple[float, ...]:
     """The weights of equation (yoshida_comp), correctly rounded."""
     with localcontext() as context:
         context.prec = 50

@@ -111,18 +111,6 @@ class Stages:
         start, end, length = np.moveaxis(self.table[::-1, ::-1], -1, 0)
         return Stages(moves, np.stack([1 - end, 1 - start, length], axis=-1))
 
-    def distinct(self, move: int, once: bool) -> tuple[np.ndarray, np.ndarray | None]:
-        """The distinct rows of a move to prepare, and which of them each row uses.
-
-        If that is done `once` for all steps, it depends on their lengths alone.
-        """
-        rows = self.table[:, move]
-        if not once:
-            return rows, None
-        lengths = np.round(rows[:, 2], 15)
-        _, first, which = np.unique(lengths, return_index=True, return_inverse=True)
-        return rows[first], which
-
 
 Moves: TypeAlias = AbstractMove | Stages
 
@@ -135,39 +123,35 @@ def inverse(moves: Moves) -> Moves:
 
 def prepare(moves: Moves, system: System, span: Span, backward: bool = False) -> PyTree:
     """What all moves need of time alone, for a step: of the inverses if `backward`."""
-    return _expand(moves, system, _distinct(moves, system, span, backward))
+    if not isinstance(moves, Stages):
+        return moves.prepare(system, span.reversed if backward else span)
+
+    def column(move: Moves, rows: np.ndarray) -> PyTree:
+        def one(*row) -> PyTree:
+            part = span.part(*row)
+            data = prepare(move, system, part, backward)
+            returns = not backward and np.any(rows[:, 1] < rows[:, 0])
+            return _unless_amplified(system, part, data) if returns else data
+
+        if len(rows) == 1:
+            row = one(*rows[0].tolist())
+            return jtu.tree_map(lambda x: jnp.expand_dims(x, 0), row)
+        return jax.vmap(one)(*(cast_to(x, span.h) for x in rows.T))
+
+    columns = zip(moves.moves, np.moveaxis(moves.table, 1, 0), strict=True)
+    return [column(*x) for x in columns]
 
 
 def prepare_once(
     moves: Moves, system: System, span: Span, backward: bool = False
 ) -> PyTree:
     """The same for all steps of one length, in a form that is applied faster."""
-    data, friction = _distinct(moves, system, span, backward), system.friction
-    if friction is not None:
-        is_leaf = lambda x: isinstance(x, Effects)
-        fixed = lambda x: friction.fix(x) if is_leaf(x) else x
-        data = jtu.tree_map(fixed, data, is_leaf=is_leaf)
-    return _expand(moves, system, data)
-
-
-def _distinct(moves: Moves, system: System, span: Span, backward: bool) -> PyTree:
-    """What is prepared, once for all rows that need the same."""
-    if not isinstance(moves, Stages):
-        return moves.prepare(system, span.reversed if backward else span)
-
-    def column(i: int, move: Moves) -> PyTree:
-        rows, _ = moves.distinct(i, system.prepares_once)
-        one = lambda *row: _distinct(move, system, span.part(*row), backward)
-        if not backward and np.any(rows[:, 1] < rows[:, 0]):
-            one = lambda *row: _unless_amplified(
-                system, part := span.part(*row), _distinct(move, system, part, False)
-            )
-        if len(rows) == 1:
-            row = one(*rows[0].tolist())
-            return jtu.tree_map(lambda x: jnp.expand_dims(x, 0), row)
-        return jax.vmap(one)(*(cast_to(x, span.h) for x in rows.T))
-
-    return [column(i, move) for i, move in enumerate(moves.moves)]
+    data, friction = prepare(moves, system, span, backward), system.friction
+    if friction is None:
+        return data
+    is_leaf = lambda x: isinstance(x, Effects)
+    fixed = lambda x: friction.fix(x) if is_leaf(x) else x
+    return jtu.tree_map(fixed, data, is_leaf=is_leaf)
 
 
 def _unless_amplified(system: System, span: Span, data: PyTree) -> PyTree:
@@ -180,23 +164,6 @@ def _unless_amplified(system: System, span: Span, data: PyTree) -> PyTree:
     grown = friction.amplification(span.t1, -span.h)
     bad = grown > 1 / math.sqrt(friction.precision)
     return jtu.tree_map(lambda x: jnp.where(bad, jnp.nan, x), data)
-
-
-def _expand(moves: Moves, system: System, data: PyTree) -> PyTree:
-    """The same for all rows."""
-    if not isinstance(moves, Stages) or not system.prepares_once:
-        return data
-
-    def column(i: int, move: Moves) -> PyTree:
-        _, which = moves.distinct(i, True)
-        rows = (
-            jax.vmap(lambda x: _expand(move, system, x))(data[i])
-            if jtu.tree_leaves(data[i])
-            else data[i]
-        )
-        return jtu.tree_map(lambda x: x[which], rows)
-
-    return [column(i, move) for i, move in enumerate(moves.moves)]
 
 
 def forward(

@@ -23,9 +23,9 @@ def _momentum_first(solver, system: System, known: bool = False) -> Stages:
     if solver.root_finder is None and not system.is_separable:
         if system.split("any") is None:
             instead = (
-                "use `PresymplecticGauss()` or `PresymplecticCoupled()`, which need "
-                "none; or, if the energy is a sum T(t, p) + V(t, q), give its parts: "
-                "`MechanicalSystem(kinetic, potential)`."
+                "use `PresymplecticGauss()`, which needs none; or, if the energy is a "
+                "sum T(t, p) + V(t, q), give its parts: `MechanicalSystem(kinetic, "
+                "potential)`."
             )
         else:
             instead = "use `Strang()` or `BlanesMoan4()`, which are explicit."

@@ -6,14 +6,7 @@ digits are kept, more than a float holds.
 
 from typing import NamedTuple
 
-from .._compositions import (
-    CompositionTableau as CompositionTableau,
-    mirror,
-    SOFRONIOU_SPALETTA_6 as SOFRONIOU_SPALETTA_6,
-    SOFRONIOU_SPALETTA_8 as SOFRONIOU_SPALETTA_8,
-    SOFRONIOU_SPALETTA_10 as SOFRONIOU_SPALETTA_10,
-    SUZUKI_4 as SUZUKI_4,
-)
+from .._compositions import mirror
 
 
 class SplittingTableau(NamedTuple):

@@ -1,6 +1,2 @@
 from ._choose import choose_step as choose_step, ChosenStep as ChosenStep
-from ._density import (
-    ArclengthDensity as ArclengthDensity,
-    DistanceDensity as DistanceDensity,
-    StepDensityController as StepDensityController,
-)
+from ._density import StepDensityController as StepDensityController

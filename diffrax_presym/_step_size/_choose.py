@@ -39,8 +39,9 @@ class ChosenStep(NamedTuple):
 
     def __str__(self) -> str:
         # A number of steps may have been tried twice.
-        tried = dict(self.trials).items()
-        trials = ", ".join(f"{n} steps: {e:.1e}" for n, e in tried)
+        tried = sorted({trial.steps: trial.error for trial in self.trials}.items())
+        show = lambda error: f"{error:.1e}" if error < math.inf else "not finite"
+        trials = ", ".join(f"{n} steps: {show(error)}" for n, error in tried)
         order = "below rounding" if math.isnan(self.order) else f"{self.order:.1f}"
         claim = self.claimed_order
         scheme = "" if claim is None else f", that of the scheme {claim}"
@@ -162,7 +163,15 @@ def choose_step(
     # Of a solve that fails, the saved times are not known.
     tried = map(run, takewhile(lambda n: n <= max_steps, doubling(4)))
     first = next((x for x in tried if x.finite), None)
-    grid = None if first is None else intervals(first.ts, t0, t1)
+    grid = None
+    if first is not None:
+        if not np.all(np.abs(first.ts - t0) <= abs(t1 - t0) * (1 + 1e-6)):
+            raise ValueError(
+                f"`choose_step(solve, t0, t1)` needs the times of the solve, but got "
+                f"{t0} and {t1}, and the solve saves at times up to "
+                f"{np.max(np.abs(first.ts - t0)):.6g} from `t0`."
+            )
+        grid = intervals(first.ts, t0, t1)
     best, convergence = find_steps(run, tolerances, grid, max_steps)
     return ChosenStep(
         dt0=length(best.number),
@@ -172,7 +181,7 @@ def choose_step(
         claimed_order=convergence.claimed,
         on_grid=grid is not None
         and (best.number % grid == 0 or grid % best.number == 0),
-        trials=tuple(Trial(x.steps, x.error) for x in convergence.trials),
+        trials=tuple(convergence.trials),
     )
 
 

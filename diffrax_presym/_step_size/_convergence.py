@@ -22,12 +22,7 @@ class Trial(NamedTuple):
     steps: int
     # The estimated error over the tolerance; infinite if the solve is not finite.
     error: float
-
-
-class _Trial(NamedTuple):
     number: int  # of steps that was asked for
-    steps: int  # that were taken
-    error: float
 
 
 @contextlib.contextmanager
@@ -95,7 +90,7 @@ def find_steps(
     tolerances: tuple[float, float],
     grid: int | None,
     max_steps: int,
-) -> tuple[_Trial, "Convergence"]:
+) -> tuple[Trial, "Convergence"]:
     """The smallest number of steps found that reaches the tolerance, and its error."""
     convergence = Convergence(tolerances, max_steps)
     for n in _numbers(1 if grid is None else grid):
@@ -131,7 +126,7 @@ class Convergence:
 
     def __init__(self, tolerances: tuple[float, float], max_steps: int):
         self.max_steps, self.tolerances = max_steps, tolerances
-        self.trials: list[_Trial] = []
+        self.trials: list[Trial] = []
         self.order, self.claimed = math.nan, None
         self.finest: Solution | None = None
         self._difference = math.inf
@@ -160,7 +155,7 @@ class Convergence:
             ratio = coarse.steps / self.trials[-1].steps
             self.order = math.log(last / self._difference) / math.log(ratio)
         error = self.correct(coarse.steps, self._difference)
-        self.trials.append(_Trial(coarse.number, coarse.steps, error))
+        self.trials.append(Trial(coarse.steps, error, coarse.number))
         # An order far above the claim is that of leaving an unstable step behind.
         regular = self._least_order <= self.order <= self.highest_order
         slow = self.order >= 0.75 and before >= 0.75
@@ -176,10 +171,10 @@ class Convergence:
         self._check_rounding(regular or slow, coarse, solution)
         return False
 
-    def measure(self, solution: Solution) -> _Trial:
+    def measure(self, solution: Solution) -> Trial:
         """The error of another solution, over the tolerance."""
         error = self.correct(solution.steps, self._distance(solution, self.finest))
-        self.trials.append(_Trial(solution.number, solution.steps, error))
+        self.trials.append(Trial(solution.steps, error, solution.number))
         return self.trials[-1]
 
     def correct(self, steps: int, difference: float) -> float:
@@ -190,46 +185,46 @@ class Convergence:
         left = 1 - (steps / self.finest.steps) ** order
         return difference / left if left > 0 else difference
 
-    def exceeds(self) -> str:
+    def exceeds(self, needed: str = "more") -> str:
         """The error message where more steps than `max_steps` are needed."""
         if len(self.trials) < 2:
             return (
                 f"`choose_step(max_steps={self.max_steps})` is too few steps to find "
                 "an error: at least three solves are needed."
             )
-        _, steps, error = self.trials[-1]
+        steps, error, _ = self.trials[-1]
+        claimed = "" if self.claimed is None else f", that of the scheme {self.claimed}"
+        found = (
+            f"with {steps} steps the error is {error:.1e} times the tolerance, and the "
+            f"measured order {self.order:.1f}{claimed}"
+        )
         if not error < math.inf:
-            return (
-                f"`choose_step` found no finite solution with up to {self.max_steps} "
-                "steps. Check that the solution exists up to `t1`, that the force is "
-                "finite along it, and that the solve allows as many steps "
+            what, found = "found no finite solution", f"up to {self.max_steps} steps"
+            advice = (
+                "Check that the solution exists up to `t1`, that the force is finite "
+                "along it, and that the solve allows as many steps "
                 "(`diffeqsolve(..., max_steps=None)`)."
             )
-        if not self.order >= self._least_order:
-            claimed = "" if self.claimed is None else f" instead of {self.claimed}"
-            return (
-                f"`choose_step` found no regular convergence with up to "
-                f"{self.max_steps} steps: with {steps} steps the error is {error:.1e} "
-                f"times the tolerance, and the measured order is {self.order:.1f}"
-                f"{claimed}. Check that the motion is not chaotic, and that the force "
-                "is smooth: if it has kinks at known times, write "
+        elif not self.order >= self._least_order:
+            what = f"found no regular convergence with up to {self.max_steps} steps"
+            advice = (
+                "Check that the motion is not chaotic, and that the force is smooth: "
+                "if it has kinks at known times, write "
                 "`stepsize_controller=StepsBetween(times)`; otherwise use a shorter "
                 "time span or a larger tolerance."
             )
-        return (
-            f"`choose_step` needs more than {self.max_steps} steps: with {steps} steps "
-            f"the error is {error:.1e} times the tolerance, and the measured order "
-            f"{self.order:.1f}. {_INSTEAD}"
-        )
+        else:
+            what = f"needs {needed} than {self.max_steps} steps (`max_steps`)"
+            advice = (
+                "Use a scheme of higher order, for example `TunedRKN6()`, a larger "
+                "tolerance, or allow more steps: `max_steps=...`."
+            )
+        return f"`choose_step` {what}: {found}. {advice}"
 
     def _check_affordable(self, steps: int, error: float):
         needed = steps * error ** (1 / self.order)
         if needed > 2 * self.max_steps:
-            raise RuntimeError(
-                f"`choose_step` needs about {needed:.1e} steps, but `max_steps` is "
-                f"{self.max_steps}: with {steps} steps the error is {error:.1e} times "
-                f"the tolerance, and the measured order {self.order:.1f}. {_INSTEAD}"
-            )
+            raise RuntimeError(self.exceeds(f"about {needed:.1e}, more"))
 
     def _check_rounding(self, converges: bool, coarse: Solution, fine: Solution):
         """An error if solves have stopped converging."""
@@ -239,33 +234,25 @@ class Convergence:
         self._stalls = self._stalls + 1 if self.order < 0.5 else 0
         if self._difference < self._least:
             self._least, self._at = self._difference, coarse.steps
-        pairs = [
-            (a, b)
-            for a, b in zip(coarse.leaves, fine.leaves, strict=True)
-            if np.issubdtype(b.dtype, np.floating)
-        ]
+        pairs = zip(coarse.leaves, fine.leaves, strict=True)
+        pairs = [x for x in pairs if np.issubdtype(x[1].dtype, np.floating)]
         precision = max((b.dtype for _, b in pairs), key=lambda x: np.finfo(x).eps)
-        eps = float(np.finfo(precision).eps)
-        change = max(
-            float(np.max(np.abs(np.asarray(a, float) - b), initial=0))
-            / max(float(np.max(np.abs(b), initial=0)), 1e-300)
-            for a, b in pairs
+        eps, size = (
+            float(np.finfo(precision).eps),
+            lambda x: np.max(np.abs(x), initial=0),
         )
+        change = max(float(size(a - b) / max(size(b), 1e-300)) for a, b in pairs)
         rounding = change < 1e3 * eps or (self._regular and change < eps**0.25)
         if self._stalls >= 2 and rounding:
-            ways = [
-                "`adjoint=FixedStepAdjoint()`, whose steps have one length without "
-                "rounding",
-                "`Compensated(solver)`",
-                "double precision (`jax.config.update('jax_enable_x64', True)`)",
-            ]
+            double = "double precision (`jax.config.update('jax_enable_x64', True)`), "
             # Only the loop of the package tells the order.
-            ways = ways[self.claimed is not None : 3 if precision == np.float32 else 2]
+            equal = "`adjoint=FixedStepAdjoint()`, whose steps are all equal, "
             raise RuntimeError(
                 f"`choose_step` cannot reach this tolerance in {precision}: "
                 f"from {self._at} steps on, solves with more steps differ by rounding, "
                 f"by {self._least:.1e} times the tolerance or more. Use "
-                f"{', '.join(ways)} or a larger tolerance."
+                f"{equal if self.claimed is None else ''}`Compensated(solver)`, "
+                f"{double if precision == np.float32 else ''}or a larger tolerance."
             )
 
     def _distance(self, solution: Solution, finest: Solution | None) -> float:
@@ -273,12 +260,6 @@ class Convergence:
         if not (solution.finite and finest.finite):
             return math.inf
         return scaled_error(solution.leaves, finest.leaves, *self.tolerances)
-
-
-_INSTEAD = (
-    "Use a scheme of higher order, for example `TunedRKN6()`, a larger tolerance, or "
-    "allow more steps: `max_steps=...`."
-)
 
 
 def _numbers(grid: int) -> Iterator[int]:
@@ -304,11 +285,11 @@ def doubling(n: int) -> Iterator[int]:
 
 def _smallest(
     convergence: Convergence, solve: Callable[[int], Solution], grid: int | None
-) -> _Trial:
+) -> Trial:
     """A smaller number of steps than the last that reaches the tolerance."""
     measure = lambda n: convergence.measure(solve(n))
     *trials, high = convergence.trials
-    low = next((t for t in reversed(trials) if t.error > 1), _Trial(0, 0, math.inf))
+    low = next((t for t in reversed(trials) if t.error > 1), Trial(0, math.inf, 0))
     every = lambda low, high: np.arange(low + 1, high)
     steepest = 1.5 * (convergence.claimed or convergence.highest_order)
     if grid is None:
@@ -327,11 +308,11 @@ def _smallest(
 
 def _search(
     between: Callable[[int, int], np.ndarray],
-    low: _Trial,
-    high: _Trial,
-    measure: Callable[[int], _Trial],
+    low: Trial,
+    high: Trial,
+    measure: Callable[[int], Trial],
     steepest: float,
-) -> _Trial:
+) -> Trial:
     """A smaller number of steps than `high` that reaches the tolerance."""
     failed = False
     for _ in range(6):

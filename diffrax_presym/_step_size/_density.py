@@ -4,75 +4,10 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Inexact, PyTree
+from jaxtyping import ArrayLike
 
-from .._misc import as_positive, cast_to, describe, tree_dot
+from .._misc import as_positive, cast_to, describe, Scalar
 from .._system._base import AbstractSystem
-
-
-Scalar = Inexact[Array, ""]
-
-
-class DistanceDensity(eqx.Module):
-    r"""The step density of distances, $\sigma = \big( \sum_k r_k^{-2s} \big)^{-1/2}$.
-
-    For one distance this is $\sigma = r^s$. For attraction that is unbounded as bodies
-    approach each other: with $s = 3/2$, by Kepler's third law, a close encounter takes
-    as many steps as a distant one. It needs no force evaluation.
-    """
-
-    power: Scalar
-    distances: Callable[[PyTree], Array]
-
-    def __init__(self, power: ArrayLike = 1.5, distances: Callable | None = None):
-        r"""**Arguments:**
-
-        - `power`: the exponent $s$, a positive number. Defaults to 3/2.
-        - `distances`: a function `distances(q)` that returns an array of all relevant
-            distances. Defaults to that from the origin, over the last axis of `q`. For
-            bodies that attract each other return those of all pairs.
-
-        **Raises:**
-
-        `ValueError` if the power is known not to be positive.
-        """
-        self.power = as_positive(power, "`DistanceDensity(power)`")
-        self.distances = _from_origin if distances is None else distances
-
-    def __call__(self, t, y, args):
-        logs = jnp.log(self.distances(y[0]))
-        power = cast_to(self.power, logs)
-        return jnp.exp(-jax.nn.logsumexp(-2 * power * logs) / 2)
-
-
-def _from_origin(q):
-    return jnp.linalg.norm(jnp.atleast_1d(q), axis=-1)
-
-
-class ArclengthDensity(eqx.Module):
-    r"""The step density of arclength, $\sigma = |(\dot q, \dot p)|^{-1}$.
-
-    Steps have equal length in phase space. For motion of uneven speed, without
-    knowledge of where it is fast; `q` and `p` should be of similar size. It costs one
-    force evaluation per step, and its derivative along the motion.
-    """
-
-    system: AbstractSystem
-
-    def __init__(self, system: AbstractSystem):
-        """**Arguments:**
-
-        - `system`: the system of the solve.
-
-        **Raises:**
-
-        `ValueError` if it is not one of this package.
-        """
-        self.system = _as_system(system, "ArclengthDensity")
-
-    def __call__(self, t, y, args):
-        slope = self.system.vf(t, y, args)
-        return jax.lax.rsqrt(tree_dot(slope, slope))
 
 
 class StepDensityController(dfx.AbstractStepSizeController):
@@ -91,8 +26,13 @@ class StepDensityController(dfx.AbstractStepSizeController):
 
     For very uneven motion, such as close encounters; with every symmetric scheme of
     this package and any solver of Diffrax. Not for smooth motion, where constant steps
-    are cheaper. Requires `dt0=None`; a solve fails with `RESULTS.dt_min_reached` if a
-    step vanishes, as it does where the density is infinite.
+    are cheaper. For attraction that is unbounded as bodies approach each other take the
+    distance to the power 3/2, by Kepler's third law: a close encounter takes as many
+    steps as a distant one. Of several distances take
+    $\big( \sum_k r_k^{-3} \big)^{-1/2}$. Steps of equal length in phase space have the
+    density $|(\dot q, \dot p)|^{-1}$. Requires `dt0=None`; a solve fails with
+    `RESULTS.dt_min_reached` if a step vanishes, as it does where the density is
+    infinite.
 
     ??? cite "Reference"
 
@@ -122,7 +62,7 @@ class StepDensityController(dfx.AbstractStepSizeController):
             number, in units of time if the density has none.
         - `density`: the step density $\sigma$, a function `density(t, y, args)` that
             returns a positive scalar; for example
-            [`diffrax_presym.DistanceDensity`][].
+            `lambda t, y, args: jnp.linalg.norm(y[0]) ** 1.5`.
 
         **Raises:**
 
@@ -130,13 +70,18 @@ class StepDensityController(dfx.AbstractStepSizeController):
         one of this package, and when the solve is traced if `dt0` is
         given or the density is not a scalar.
         """
-        self.system = _as_system(system, "StepDensityController")
+        if not isinstance(system, AbstractSystem):
+            raise ValueError(
+                "`StepDensityController(system, ...)` needs the system of the solve, "
+                f"such as a `MechanicalSystem`, but got {system!r}."
+            )
+        self.system = system
         self.epsilon = as_positive(epsilon, "`StepDensityController(epsilon=...)`")
         if not callable(density):
             raise ValueError(
                 "`StepDensityController(density=...)` must be a function `density(t, "
-                f"y, args)`, but got {density!r}. Write for example "
-                "`DistanceDensity()`."
+                f"y, args)`, but got {density!r}. Write for example `lambda t, y, "
+                "args: jnp.linalg.norm(y[0]) ** 1.5`."
             )
         self.density = density
         self.direction = 1
@@ -209,12 +154,3 @@ class StepDensityController(dfx.AbstractStepSizeController):
         slope = jax.tree.map(lambda dy: cast_to(self.direction, dy) * dy, slope)
         value, rate = jax.jvp(log_density, (t, y), (jnp.ones_like(t), slope))
         return value, -cast_to(self.epsilon, t) * jnp.exp(value) * rate
-
-
-def _as_system(system, name: str) -> AbstractSystem:
-    if not isinstance(system, AbstractSystem):
-        raise ValueError(
-            f"`{name}` needs the system of the solve, such as a `MechanicalSystem`, "
-            f"but got {system!r}. Write `{name}(system, ...)`."
-        )
-    return system

@@ -1,6 +1,5 @@
 import abc
 from collections.abc import Callable
-from typing import Any
 
 import diffrax as dfx
 import jax.numpy as jnp
@@ -9,7 +8,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Inexact, PyTree
 
 from .._friction._base import AbstractFriction, Mechanics, Parts
-from .._friction._damping import AbstractDamping
+from .._friction._damping import Damping
 from .._friction._fit import fit_friction, one_rate
 from .._friction._linear import LinearFriction
 from .._misc import (
@@ -90,14 +89,14 @@ class AbstractSystem(dfx.AbstractTerm):
         return None
 
     @property
-    def parts(self) -> Parts:
-        """The friction, by where it acts. None by default."""
-        return Parts()
+    def laws(self) -> tuple[AbstractFriction, ...]:
+        """The laws of friction. None by default."""
+        return ()
 
     @property
     def mechanics(self) -> Mechanics:
         """What friction needs to know of the system; by default nothing is known."""
-        return Mechanics(None, None, has_mass=False)
+        return Mechanics(has_mass=False)
 
     @property
     def drift_is_autonomous(self) -> bool:
@@ -122,7 +121,26 @@ class AbstractSystem(dfx.AbstractTerm):
     def prod(self, vf: State, control) -> State:
         return tree_scale(control, vf)
 
-    # Friction.
+    # Friction, and other forces.
+
+    @property
+    def parts(self) -> Parts:
+        """The friction, by where it acts; `ValueError` if a law does not fit."""
+        each = [law.parts(self.mechanics) for law in self.laws]
+        return sum(each, Parts())  # pyright: ignore
+
+    def add_forces(
+        self, force: P, external: Callable | None, t: Time, q: Q, p: P, v: Q, args
+    ) -> P:
+        """A force, and what else acts on a state of velocity `v`: the friction that is
+        not part of drifts, and a user's force `external(t, q, v, args)`."""
+        for law in self.laws:
+            if not law.parts(self.mechanics).linear:
+                force = tree_sum(force, law.force(t, q, p, v, args))
+        if external is None:
+            return force
+        value = external(t, q, v, args)
+        return tree_sum(force, match(value, q, "`force`", "`q`"))
 
     def fit_friction(self, p: P) -> LinearFriction | None:
         """The linear friction that depends on time alone, for momenta like `p`."""
@@ -130,11 +148,12 @@ class AbstractSystem(dfx.AbstractTerm):
 
     def friction_force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         """The force of all friction."""
-        friction, zero = self.fit_friction(p), tree_zeros(p)
-        return zero if friction is None else friction.net_force(t, zero, p)
+        v, friction = self.velocity(t, q, p, args), self.fit_friction(p)
+        force = self.add_forces(tree_zeros(p), None, t, q, p, v, args)
+        return force if friction is None else friction.net_force(t, force, p)
 
     @property
-    def damping(self) -> AbstractDamping | None:
+    def damping(self) -> Damping | None:
         """The law of friction, if that is one rate for all momenta; `ValueError` if
         there is other friction."""
         return one_rate(self.parts)
@@ -173,35 +192,6 @@ class AbstractSystem(dfx.AbstractTerm):
         return q, self.velocity(t, q, p, args)
 
 
-class AbstractKineticSystem(AbstractSystem):
-    """A system with a kinetic part of known flow, the drift of a
-    [`diffrax_presym.extend.KineticSplit`][]."""
-
-    @abc.abstractmethod
-    def prepare_drift(
-        self, friction: LinearFriction | None, t: Time, h: Time, order: int
-    ) -> PyTree:
-        """What the flow of the kinetic part from `t` to `t + h`, friction included,
-        needs of time alone."""
-
-    @abc.abstractmethod
-    def drift(
-        self,
-        friction: LinearFriction | None,
-        t: Time,
-        h: Time,
-        data: Any,
-        q: Q,
-        p: P,
-        args: PyTree,
-    ) -> tuple[Q, P | None]:
-        """The changes of `q` and `p` over the flow of the kinetic part."""
-
-    @abc.abstractmethod
-    def potential_force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
-        r"""The force $-\partial V / \partial q$ of the potential part."""
-
-
 def check_state(y: PyTree) -> None:
     wanted = "The state must be a pair `(q, p)` of positions and momenta"
     if type(y) is not tuple or len(y) != 2:
@@ -228,25 +218,3 @@ def momentum_of(system: AbstractSystem, t: Time, q: Q, v: Q, args: PyTree) -> St
     eps = max(float(jnp.finfo(x.dtype).eps) for x in jtu.tree_leaves(v))
     finder = optx.Newton(rtol=10 * eps, atol=10 * eps)
     return q, optx.root_find(residual, finder, v).value
-
-
-def add_forces(
-    force: P,
-    laws: tuple[AbstractFriction, ...],
-    mechanics: Mechanics,
-    external: Callable | None,
-    t: Time,
-    q: Q,
-    p: P,
-    v: Q,
-    args: PyTree,
-) -> P:
-    """A force, and what else acts on a state of velocity `v`: the friction that is not
-    part of drifts, and a user's force `external(t, q, v, args)`."""
-    for law in laws:
-        if not law.parts(mechanics).linear:
-            force = tree_sum(force, law.force(t, q, p, v, args))
-    if external is None:
-        return force
-    value = external(t, q, v, args)
-    return tree_sum(force, match(value, q, "`force`", "`q`"))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, PyTree
 
-from .._friction._damping import AbstractDamping
+from .._friction._damping import Damping
 from .._friction._linear import LinearFriction
 from .._misc import cast_to, State, Time, tree_sub, tree_zeros, values
 from ._base import AbstractSystem
@@ -77,10 +77,6 @@ class System(eqx.Module):
         """The vector field without linear friction."""
         return self.term.velocity_and_force(t, *values(y), self.args)
 
-    def potential_force(self, t: Time, y: State) -> PyTree:
-        """The force of a kick, without that of the kinetic part."""
-        return self.term.potential_force(t, *values(y), self.args)
-
     def slope(self, t: Time, y: State, force: PyTree | None = None) -> State:
         """The full vector field, with friction. Reuses a given force."""
         y = values(y)
@@ -118,7 +114,7 @@ class System(eqx.Module):
         return jtu.tree_map(jnp.add, p, self.friction.decay(data, p))
 
     @property
-    def one_rate(self) -> AbstractDamping | None:
+    def one_rate(self) -> Damping | None:
         """The law of friction, where it is known to be one rate for all momenta."""
         return self.term.damping
 

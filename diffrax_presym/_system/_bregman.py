@@ -1,31 +1,61 @@
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 from jaxtyping import Array, Bool, PyTree
 
-from .._friction._base import Mechanics, Parts
-from .._friction._linear import LinearFriction
+from .._friction._base import AbstractFriction
 from .._misc import (
     all_finite,
     check_callable,
     match,
     Scalar,
     scalar_fn,
+    State,
     Time,
     tree_add,
     tree_dot,
     tree_scale,
     tree_sub,
     tree_sum,
+    values,
 )
-from ._base import AbstractKineticSystem, P, Q
+from ._base import AbstractSystem, P, Q
 from ._mirror import AbstractMirrorMap
 from ._scaling import AbstractScaling
-from ._split import AbstractSplit, KineticSplit
+from ._split import AbstractSplit
 
 
-class BregmanHamiltonian(AbstractKineticSystem):
+class BregmanSplit(AbstractSplit):
+    """The drift is the flow of the Bregman divergence, the kick that of the
+    objective."""
+
+    kinds: frozenset[str] = eqx.field(static=True)
+
+    def __init__(self, is_quadratic: bool):
+        quadratic = {"separable", "nystrom"} if is_quadratic else set()
+        self.kinds = frozenset({"any"} | quadratic)
+
+    def prepare(self, system, t, h, order) -> PyTree:
+        friction: Any = system.friction  # there always is some
+        return friction.prepare(t, h, order)
+
+    def drift(self, system, t, h, data, y) -> State:
+        mirror, (q, p) = system.term.mirror_map, values(y)
+        friction: Any = system.friction
+        dq = tree_scale(-1, friction.decay(data, mirror.step(q, p)))
+        if mirror.is_quadratic:
+            return system.add(y, (dq, friction.decay(data, p)))
+        # A drift leaves grad h(q) + p constant.
+        change = tree_scale(-1, mirror.change(q, dq))
+        return system.add(y, (dq, mirror.project(change)))
+
+    def force(self, system, t, y) -> PyTree:
+        return system.term.potential_force(t, values(y)[0], system.args)
+
+
+class BregmanHamiltonian(AbstractSystem):
     r"""The Bregman Hamiltonian, whose motion minimises a function $f$,
     $H = e^{\alpha + \gamma} [ D_{h^*}(\nabla h(q) + e^{-\gamma} P, \nabla h(q))
     + e^\beta f(q) ]$.
@@ -77,7 +107,7 @@ class BregmanHamiltonian(AbstractKineticSystem):
             raise ValueError(
                 "`mirror_map` must be a mirror map such as `EntropyMirror()`, but got "
                 f"{mirror_map!r}. For a custom function `h(q)` write "
-                "`MirrorMap(h, root_finder=...)`."
+                "`MirrorMap(h, inverse)`."
             )
         if not isinstance(scaling, AbstractScaling):
             raise ValueError(
@@ -93,13 +123,12 @@ class BregmanHamiltonian(AbstractKineticSystem):
         self.gradient_fn = gradient
 
     @property
-    def parts(self) -> Parts:
-        return self.scaling.gamma.parts(Mechanics(None, has_mass=False))
+    def laws(self) -> tuple[AbstractFriction, ...]:
+        return (self.scaling.gamma,)
 
     @property
     def splits(self) -> tuple[AbstractSplit, ...]:
-        linear = self.mirror_map.is_quadratic
-        return (KineticSplit(separable=linear, nystrom=linear),)
+        return (BregmanSplit(self.mirror_map.is_quadratic),)
 
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         h, step = self.mirror_map, self.mirror_map.step(q, p)
@@ -116,7 +145,7 @@ class BregmanHamiltonian(AbstractKineticSystem):
         return tree_scale(self.scaling.rate(t), self.mirror_map.step(q, p))
 
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
-        force = self.potential_force(t, q, p, args)
+        force = self.potential_force(t, q, args)
         if self.mirror_map.is_quadratic:
             return force
         step = self.mirror_map.step(q, p)
@@ -125,37 +154,14 @@ class BregmanHamiltonian(AbstractKineticSystem):
         kinetic = self.mirror_map.project(tree_sub(p, change))
         return tree_add(force, self.scaling.rate(t), kinetic)
 
-    def potential_force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
+    def potential_force(self, t: Time, q: Q, args: PyTree = None) -> P:
+        """The force of the objective."""
         if self.gradient_fn is None:
             objective = scalar_fn(self.objective, "The objective")
             slope = jax.grad(objective, argnums=1)(t, q, args)
         else:
             slope = match(self.gradient_fn(t, q, args), q, "`gradient`", "`q`")
         return tree_scale(-self.scaling.strength(t), self.mirror_map.project(slope))
-
-    def prepare_drift(
-        self, friction: LinearFriction | None, t: Time, h: Time, order: int
-    ) -> PyTree:
-        assert friction is not None
-        return friction.prepare(t, h, order)
-
-    def drift(
-        self,
-        friction: LinearFriction | None,
-        t: Time,
-        h: Time,
-        data: Any,
-        q: Q,
-        p: P,
-        args: PyTree,
-    ) -> tuple[Q, P]:
-        assert friction is not None
-        dq = tree_scale(-1, friction.decay(data, self.mirror_map.step(q, p)))
-        if self.mirror_map.is_quadratic:
-            return dq, friction.decay(data, p)
-        # A drift leaves grad h(q) + p constant.
-        change = tree_scale(-1, self.mirror_map.change(q, dq))
-        return dq, self.mirror_map.project(change)
 
     def is_valid(
         self, t: Time, q: Q, p: P, args: PyTree = None

@@ -3,7 +3,7 @@ from collections.abc import Callable
 import jax
 from jaxtyping import Array, Bool, PyTree
 
-from .._friction._base import AbstractFriction, Parts
+from .._friction._base import AbstractFriction
 from .._friction._damping import as_laws
 from .._misc import (
     all_finite,
@@ -12,9 +12,8 @@ from .._misc import (
     scalar_fn,
     Time,
     tree_scale,
-    tree_zeros,
 )
-from ._base import AbstractSystem, add_forces, P, Q
+from ._base import AbstractSystem, P, Q
 from ._split import AbstractSplit
 
 
@@ -23,10 +22,9 @@ class Hamiltonian(AbstractSystem):
 
     For energies that are not a sum $T(t, p) + V(t, q)$, which
     [`diffrax_presym.MechanicalSystem`][] takes. Euler and leapfrog are implicit for it
-    and need a root finder; [`diffrax_presym.PresymplecticGauss`][] and
-    [`diffrax_presym.PresymplecticCoupled`][] do not. If part of its motion has a known
-    flow, such as along Kepler's orbits, pass that as a split: splittings are then
-    explicit.
+    and need a root finder; [`diffrax_presym.PresymplecticGauss`][] does not. If part of
+    its motion has a known flow, such as along Kepler's orbits, pass that as a split:
+    splittings are then explicit.
 
     !!! warning
 
@@ -72,9 +70,8 @@ class Hamiltonian(AbstractSystem):
         _ = self.parts  # An error if a law does not fit the system.
 
     @property
-    def parts(self) -> Parts:
-        each = [law.parts(self.mechanics) for law in self.friction]
-        return sum(each, Parts())  # pyright: ignore
+    def laws(self) -> tuple[AbstractFriction, ...]:
+        return self.friction
 
     @property
     def splits(self) -> tuple[AbstractSplit, ...]:
@@ -94,16 +91,8 @@ class Hamiltonian(AbstractSystem):
         self, t: Time, q: Q, p: P, args: PyTree = None
     ) -> tuple[Q, P]:
         slope, velocity = jax.grad(self.energy, argnums=(1, 2))(t, q, p, args)
-        forces = self.friction, self.mechanics, self.external
-        state = t, q, p, velocity, args
-        return velocity, add_forces(tree_scale(-1, slope), *forces, *state)
-
-    def friction_force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
-        state = t, q, p, self.velocity(t, q, p, args), args
-        forces = self.friction, self.mechanics, None
-        force = add_forces(tree_zeros(p), *forces, *state)
-        friction = self.fit_friction(p)
-        return force if friction is None else friction.net_force(t, force, p)
+        force, state = tree_scale(-1, slope), (t, q, p, velocity, args)
+        return velocity, self.add_forces(force, self.external, *state)
 
     def is_valid(
         self, t: Time, q: Q, p: P, args: PyTree = None

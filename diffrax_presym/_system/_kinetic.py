@@ -10,9 +10,9 @@ import lineax as lx
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
 from .._forms import as_form, divide, multiply
+from .._friction._base import MASS
 from .._friction._exponential import gauss_legendre
 from .._friction._linear import LinearFriction
-from .._friction._rates import MASS
 from .._misc import (
     as_positive,
     cast_to,

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 from jaxtyping import Array, Bool, Inexact, PyTree
 
-from .._friction._base import AbstractFriction, Mechanics, Parts
+from .._friction._base import AbstractFriction, Mechanics
 from .._friction._damping import as_laws
 from .._misc import (
     all_finite,
@@ -18,7 +18,7 @@ from .._misc import (
     scalar_fn,
     Time,
 )
-from ._base import AbstractSystem, add_forces
+from ._base import AbstractSystem
 from ._split import AbstractSplit
 
 
@@ -110,13 +110,12 @@ class LagrangianSystem(AbstractSystem):
         _ = self.parts  # An error if a law does not fit the system.
 
     @property
-    def mechanics(self) -> Mechanics:
-        return Mechanics(None, mass_varies=True)
+    def laws(self) -> tuple[AbstractFriction, ...]:
+        return self.friction
 
     @property
-    def parts(self) -> Parts:
-        each = [law.parts(self.mechanics) for law in self.friction]
-        return sum(each, Parts())  # pyright: ignore
+    def mechanics(self) -> Mechanics:
+        return Mechanics(mass_varies=True)
 
     @property
     def splits(self) -> tuple[AbstractSplit, ...]:
@@ -174,18 +173,8 @@ class LagrangianSystem(AbstractSystem):
             kinetic = v @ (self.mass_matrix(t, q, args) @ v) / 2
             return kinetic - self._potential(t, q, args)
 
-        forces = self.friction, self.mechanics, self.external
-        return v, add_forces(jax.grad(lagrangian)(q), *forces, t, q, p, v, args)
-
-    def friction_force(
-        self, t: Time, q: _Vector, p: _Vector, args: PyTree = None
-    ) -> _Vector:
-        state = t, q, p, self.velocity(t, q, p, args), args
-        force = add_forces(
-            jnp.zeros_like(p), self.friction, self.mechanics, None, *state
-        )
-        friction = self.fit_friction(p)
-        return force if friction is None else friction.net_force(t, force, p)
+        force = jax.grad(lagrangian)(q)
+        return v, self.add_forces(force, self.external, t, q, p, v, args)
 
     def _potential(self, t, q, args):
         return cast_to(scalar_fn(self.potential, "The potential")(t, q, args), q)

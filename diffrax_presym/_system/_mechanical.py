@@ -1,39 +1,22 @@
 """Mechanical systems with any friction."""
 
 from collections.abc import Callable
-from typing import Any
 
-import equinox as eqx
 import jax
-import jax.lax as lax
-import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import Array, Bool, PyTree
 
-from .._compositions import spans
-from .._friction._base import AbstractFriction, Linear, Mechanics, Parts
+from .._friction._base import AbstractFriction, Mechanics
 from .._friction._damping import as_laws
-from .._friction._drag import Drag
-from .._friction._fit import fit_friction, has_one_rate
-from .._friction._linear import LinearFriction
-from .._friction._log_scale import Linear as LinearScale
-from .._misc import (
-    all_finite,
-    check_callable,
-    Scalar,
-    scalar_fn,
-    Time,
-    tree_scale,
-    tree_sum,
-    tree_zeros,
-)
-from ._base import AbstractKineticSystem, add_forces, momentum_of, P, Q
+from .._friction._fit import has_one_rate
+from .._misc import all_finite, check_callable, Scalar, scalar_fn, Time
+from ._base import AbstractSystem, momentum_of, P, Q
 from ._kinetic import AbstractKinetic, as_kinetic, QuadraticKinetic
+from ._mechanical_splits import KineticSplit, LocalSplit, PotentialSplit, SharedSplit
 from ._potential import AbstractPotential, as_potential, QuadraticPotential
-from ._split import AbstractSplit, KineticSplit, PotentialSplit, SharedSplit
+from ._split import AbstractSplit
 
 
-class MechanicalSystem(AbstractKineticSystem):
+class MechanicalSystem(AbstractSystem):
     r"""A mechanical system with a kinetic and a potential energy, any friction and any
     other force,
 
@@ -45,7 +28,7 @@ class MechanicalSystem(AbstractKineticSystem):
     | friction | law |
     |---|---|
     | one rate, or one for each degree of freedom | [`diffrax_presym.ConstantDamping`][], [`diffrax_presym.LogDamping`][], [`diffrax_presym.PowerDamping`][], `eta(t)` |
-    | force per velocity: dashpots, a matrix, a magnetic field | [`diffrax_presym.ViscousDamping`][], [`diffrax_presym.RayleighDamping`][] |
+    | force per velocity: dashpots, a matrix, a magnetic field | [`diffrax_presym.ViscousDamping`][] |
     | a rate or coefficients that depend on place | [`diffrax_presym.PositionDamping`][], [`diffrax_presym.ViscousDamping`][] |
     | a power of the speed | [`diffrax_presym.Drag`][] |
     | any other | `force` |
@@ -112,19 +95,14 @@ class MechanicalSystem(AbstractKineticSystem):
         _ = self.parts  # An error if a law does not fit the system.
 
     @property
-    def mechanics(self) -> Mechanics:
-        stiffness = None
-        if isinstance(self.potential, QuadraticPotential):
-            stiffness = self.potential.stiffness
-            stiffness = jnp.ones(()) if stiffness is None else stiffness
-        if isinstance(self.kinetic, QuadraticKinetic):
-            return Mechanics(self.kinetic.mass, stiffness)
-        return Mechanics(None, stiffness, has_mass=False)
+    def laws(self) -> tuple[AbstractFriction, ...]:
+        return self.friction
 
     @property
-    def parts(self) -> Parts:
-        each = [law.parts(self.mechanics) for law in self.friction]
-        return sum(each, Parts())  # pyright: ignore
+    def mechanics(self) -> Mechanics:
+        if isinstance(self.kinetic, QuadraticKinetic):
+            return Mechanics(self.kinetic.mass)
+        return Mechanics(has_mass=False)
 
     # The vector field.
 
@@ -143,9 +121,9 @@ class MechanicalSystem(AbstractKineticSystem):
         self, t: Time, q: Q, p: P, args: PyTree = None
     ) -> tuple[Q, P]:
         velocity = self.velocity(t, q, p, args)
-        force = self.potential_force(t, q, p, args)
-        forces = self.friction, self.mechanics, self.external
-        return velocity, add_forces(force, *forces, t, q, p, velocity, args)
+        force = self.potential.force(t, q, args)
+        state = t, q, p, velocity, args
+        return velocity, self.add_forces(force, self.external, *state)
 
     def from_velocity(
         self, t: Time, y: tuple[Q, Q], args: PyTree = None
@@ -155,22 +133,11 @@ class MechanicalSystem(AbstractKineticSystem):
             return y[0], self.kinetic.momentum(y[1])
         return momentum_of(self, t, *y, args)
 
-    def potential_force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
-        return self.potential.force(t, q, args)
-
-    def friction_force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
-        forces = self.friction, self.mechanics, None
-        state = t, q, p, self.velocity(t, q, p, args), args
-        force = add_forces(tree_zeros(p), *forces, *state)
-        friction = self.fit_friction(p)
-        return force if friction is None else friction.net_force(t, force, p)
-
     def is_valid(
         self, t: Time, q: Q, p: P, args: PyTree = None
     ) -> Bool[Array, ""] | None:
         # The flow of drag backwards in time ends after a finite time.
-        parts = self.parts
-        return all_finite((q, p)) if parts.drags or parts.local_drags else None
+        return all_finite((q, p)) if self.parts.drags else None
 
     # The moves.
 
@@ -179,12 +146,10 @@ class MechanicalSystem(AbstractKineticSystem):
         parts = self.parts
         if self.external is not None:
             return ()
-        if parts.local or parts.local_drags:
-            return (KineticSplit(separable=False, nystrom=False, local=True),)
-        if parts.drags:
-            return (KineticSplit(separable=False, nystrom=False),)
+        if parts.local or parts.drags:
+            return (LocalSplit(),)
         kinetic = self.kinetic
-        splits: list[AbstractSplit] = [KineticSplit(True, kinetic.is_quadratic)]
+        splits: list[AbstractSplit] = [KineticSplit(kinetic.is_quadratic)]
         if isinstance(self.potential, QuadraticPotential):
             splits.append(PotentialSplit())
         smooth = all(part.log_scale.is_smooth for part in parts.linear)
@@ -196,91 +161,3 @@ class MechanicalSystem(AbstractKineticSystem):
     @property
     def drift_is_autonomous(self) -> bool:
         return self.kinetic.is_autonomous
-
-    def prepare_drift(
-        self, friction: LinearFriction | None, t: Time, h: Time, order: int
-    ) -> PyTree:
-        drags = self.parts.drags
-        if not drags:
-            return self.kinetic.prepare(friction, t, h, order)
-        if friction is None and len(drags) == 1:
-            return None
-        prepare = lambda s, h: self.kinetic.prepare(friction, t + s, h, order)
-        starts, lengths = spans(order, h)
-        return starts, lengths, jax.vmap(prepare)(starts, lengths)
-
-    def drift(
-        self,
-        friction: LinearFriction | None,
-        t: Time,
-        h: Time,
-        data: Any,
-        q: Q,
-        p: P,
-        args: PyTree,
-    ) -> tuple[Q, P | None]:
-        drags, mass = self.parts.drags, self.mechanics.mass
-        if not drags:
-            return self.kinetic.flow(friction, t, h, data, p, args)
-        if friction is None and len(drags) == 1:
-            return drags[0].flow(h, p, mass)
-
-        def stage(changes, row):
-            (dq, dp), (s, h, data) = changes, row
-            dp = self._slowed(drags, h / 2, p, dp)
-            flow = self.kinetic.flow(friction, t + s, h, data, tree_sum(p, dp), args)
-            dq = tree_sum(dq, flow[0])
-            dp = dp if flow[1] is None else tree_sum(dp, flow[1])
-            return (dq, self._slowed(drags[::-1], h / 2, p, dp)), None
-
-        return lax.scan(stage, (tree_zeros(p), tree_zeros(p)), data)[0]
-
-    def _slowed(self, drags: tuple[Drag, ...], h: Time, p: P, dp: P) -> P:
-        """The change of `p` after more drag over a time `h`."""
-        for drag in drags:
-            dp = tree_sum(dp, drag.flow(h, tree_sum(p, dp), self.mechanics.mass)[1])
-        return dp
-
-    def local_friction(self, t: Time, q: Q, p: P, args: PyTree) -> PyTree:
-        """The numbers at a place of the friction that depends on place."""
-        parts = self.parts
-        forms = [
-            jtu.tree_map(jnp.asarray, part.form(t, q, args)) for part in parts.local
-        ]
-        drags = [drag.at(t, q, args) for drag in parts.local_drags]
-        return forms, [(drag.coefficient, drag.medium) for drag in drags]
-
-    def local_kick(
-        self, t: Time, h: Time, p: P, force: P, local: PyTree, order: int
-    ) -> P:
-        """The change of `p` at a fixed place, by a force and the friction there.
-
-        Exact with linear friction alone, otherwise of the given order in `h`.
-        """
-        parts, (forms, numbers) = self.parts, local
-        pairs = zip(parts.local, forms, strict=True)
-        linear = [Linear(LinearScale(), x, part.per_velocity) for part, x in pairs]
-        friction = fit_friction(linear, self.mechanics, p)
-        drags = tuple(
-            eqx.tree_at(lambda x: (x.coefficient, x.medium), drag, x, is_leaf=_is_none)
-            for drag, x in zip(parts.local_drags, numbers, strict=True)
-        )
-
-        def pushed(h: Time, p: P) -> P:
-            if friction is None:
-                return tree_scale(h, force)
-            data = friction.prepare(t, h, order)
-            return tree_sum(friction.decay(data, p), friction.respond(data, force))
-
-        if not drags:
-            return pushed(h, p)
-
-        def stage(dp, h):
-            dp = self._slowed(drags, h / 2, p, dp)
-            dp = tree_sum(dp, pushed(h, tree_sum(p, dp)))
-            return self._slowed(drags[::-1], h / 2, p, dp), None
-
-        return lax.scan(stage, tree_zeros(p), spans(order, h)[1])[0]
-
-
-_is_none = lambda x: x is None

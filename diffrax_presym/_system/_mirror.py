@@ -5,12 +5,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import optimistix as optx
 from jaxtyping import Array, Bool, PyTree
 
 from .._misc import (
     all_finite,
-    check_root_finder,
+    check_callable,
     match,
     Scalar,
     scalar_fn,
@@ -54,7 +53,9 @@ class AbstractMirrorMap(eqx.Module):
     def step(self, q: PyTree, p: PyTree) -> PyTree:
         r"""The mirror step $\nabla h^*(\nabla h(q) + p) - q$; not finite where
         undefined."""
-        return _step(self, q, p)
+        image = self.gradient(q)
+        end, start = self.inverse(tree_sum(image, p)), self.inverse(image)
+        return tree_sub(end, start)
 
     def change(self, q: PyTree, dq: PyTree) -> PyTree:
         r"""The difference $\nabla h(q + dq) - \nabla h(q)$."""
@@ -160,62 +161,33 @@ class EntropyMirror(AbstractMirrorMap):
 class MirrorMap(AbstractMirrorMap):
     r"""A mirror map given by a function $h$.
 
-    $\nabla h$ is by automatic differentiation, and $\nabla h^*$ by root finding unless
-    given.
+    $\nabla h$ is by automatic differentiation. Where its inverse has no closed form,
+    let `inverse` find a root with `optimistix.root_find`.
     """
 
     is_quadratic = False
     fn: Callable
-    inverse_fn: Callable | None
+    inverse_fn: Callable
     domain: Callable | None
-    root_finder: optx.AbstractRootFinder | None
-    root_find_max_steps: int = eqx.field(static=True)
 
-    def __init__(
-        self,
-        h,
-        *,
-        inverse=None,
-        domain=None,
-        root_finder=None,
-        root_find_max_steps: int = 32,
-    ):
+    def __init__(self, h, inverse, domain=None):
         r"""**Arguments:**
 
         - `h`: a strictly convex function `h(q)` that returns a scalar.
         - `inverse`: the inverse $\nabla h^*$ of the gradient, a function `inverse(w)`.
-            Defaults to root finding.
         - `domain`: a function `domain(q)` that returns whether `q` is inside the domain
             of `h`. Defaults to where `h(q)` is finite.
-        - `root_finder`: an Optimistix root finder, needed if `inverse` is not given. It
-            starts from the position at the start of a step. Its tolerances limit how
-            well the structure is preserved. Defaults to `None`.
-        - `root_find_max_steps`: the maximum number of steps of a root find. Defaults to
-            32.
 
         **Raises:**
 
-        `ValueError` if any of these has the wrong type, or if neither `inverse` nor
-        `root_finder` is given. The solve fails if a root find fails.
+        `ValueError` if any of these is not a function.
         """
-        if not callable(h):
-            raise ValueError(f"`MirrorMap(h)` needs a function `h(q)`, but got {h!r}.")
-        for name, fn in {"inverse": inverse, "domain": domain}.items():
-            if fn is not None and not callable(fn):
-                raise ValueError(f"`{name}` must be a function, but got {fn!r}.")
-        if root_finder is not None:
-            check_root_finder(root_finder)
-        elif inverse is None:
-            raise ValueError(
-                "`MirrorMap` needs the inverse of the gradient of `h`, a function "
-                "`inverse(w)`, or a root finder, for example "
-                "`MirrorMap(h, root_finder=optimistix.Newton(rtol=1e-10, atol=1e-10))`."
-            )
+        check_callable(h, "h", "h(q)")
+        check_callable(inverse, "inverse", "inverse(w)")
+        check_callable(domain, "domain", "domain(q)", optional=True)
         self.fn = h
         self.inverse_fn = inverse
         self.domain = domain
-        self.root_finder = root_finder
-        self.root_find_max_steps = root_find_max_steps
 
     def __call__(self, q: PyTree) -> Scalar:
         return scalar_fn(self.fn, "The mirror map")(q)
@@ -224,38 +196,11 @@ class MirrorMap(AbstractMirrorMap):
         return jax.grad(self.__call__)(q)
 
     def inverse(self, w: PyTree) -> PyTree:
-        if self.inverse_fn is not None:
-            return match(self.inverse_fn(w), w, "`inverse`", "`w`")
-        return self._find(w, jtu.tree_map(jnp.ones_like, w))
-
-    def _find(self, w, guess):
-        residual = lambda q, _: tree_sub(self.gradient(q), w)
-        assert self.root_finder is not None
-        solution = optx.root_find(
-            residual,
-            self.root_finder,
-            guess,
-            max_steps=self.root_find_max_steps,
-            throw=False,
-        )
-        found = solution.result == optx.RESULTS.successful
-        return jtu.tree_map(lambda q: jnp.where(found, q, jnp.nan), solution.value)
+        return match(self.inverse_fn(w), w, "`inverse`", "`w`")
 
     def contains(self, q: PyTree) -> Bool[Array, ""]:
         inside = all_finite(self(q)) if self.domain is None else self.domain(q)
         return all_finite(q) & jnp.all(inside)
-
-    def step(self, q: PyTree, p: PyTree) -> PyTree:
-        if self.inverse_fn is not None:
-            return _step(self, q, p)
-        w = tree_sum(self.gradient(q), p)
-        return tree_sub(self._find(w, q), q)
-
-
-def _step(mirror_map: AbstractMirrorMap, q: PyTree, p: PyTree) -> PyTree:
-    image = mirror_map.gradient(q)
-    there, here = mirror_map.inverse(tree_sum(image, p)), mirror_map.inverse(image)
-    return tree_sub(there, here)
 
 
 def _everywhere(condition: Callable, q: PyTree) -> Bool[Array, ""]:

@@ -1,23 +1,19 @@
 """The families of Hamiltonians of the paper, as systems."""
 
-from collections.abc import Callable
 from typing import Any, ClassVar
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from .._friction._base import Mechanics, Parts
-from .._friction._damping import AbstractDamping, as_laws, ConstantDamping
+from .._friction._damping import as_laws, ConstantDamping, Damping
 from .._friction._fit import fit_friction, one_rate
 from .._friction._linear import LinearFriction
-from .._misc import check_callable, Scalar, scalar_fn, Time, tree_scale
+from .._misc import Scalar, scalar_fn, Time, tree_scale
 from ._energy import Hamiltonian
 from ._kinetic import (
     AbstractKinetic,
     as_kinetic,
-    CallableKinetic,
     integrate,
     prepare_quadrature,
 )
@@ -67,16 +63,13 @@ def ConformalHamiltonian(
     return system
 
 
-def DissipativeHamiltonian(
-    kinetic, potential, eta1, eta2, *, separable: bool = True
-) -> MechanicalSystem | Hamiltonian:
-    r"""The general family
-    $H = e^{-\eta_1(t)} T(t, q, P) + e^{\eta_2(t)} f(t, q)$.
+def DissipativeHamiltonian(kinetic, potential, eta1, eta2) -> MechanicalSystem:
+    r"""The general family $H = e^{-\eta_1(t)} T(t, P) + e^{\eta_2(t)} f(t, q)$.
 
     Equation (gen_ham) of França, Jordan and Vidal (2021), where $P$ is the canonical
     momentum. The log scale is $\eta_2$, so the state holds
     $p = e^{-\eta_2(t)} P$ and the energy is
-    $E = e^{-\eta_1 - \eta_2} T(t, q, e^{\eta_2} p) + f(t, q)$. For
+    $E = e^{-\eta_1 - \eta_2} T(t, e^{\eta_2} p) + f(t, q)$. For
     [`diffrax_presym.QuadraticKinetic`][] that is $e^{\eta_2 - \eta_1} T(p) + f$, and
     with $\eta_1 = \eta_2$ the same system as
     [`diffrax_presym.ConformalHamiltonian`][].
@@ -88,16 +81,16 @@ def DissipativeHamiltonian(
     **Arguments:**
 
     - `kinetic`: the kinetic energy $T$ as a function of the *canonical* momentum: for
-        example [`diffrax_presym.QuadraticKinetic`][], or a function `T(t, P, args)`;
-        with `separable=False`, a function `T(t, q, P, args)`.
+        example [`diffrax_presym.QuadraticKinetic`][], or a function `T(t, P, args)`.
+        One that depends on `q` too is the energy $E$ of a
+        [`diffrax_presym.Hamiltonian`][].
     - `potential`: the function $f$ to minimise, or potential energy, a function
         `f(t, q, args)` that returns a scalar.
     - `eta1`, `eta2`: damping laws or functions of time.
-    - `separable`: whether `kinetic` does not depend on `q`. Defaults to `True`.
 
     **Returns:**
 
-    A [`diffrax_presym.MechanicalSystem`][] or a [`diffrax_presym.Hamiltonian`][].
+    A [`diffrax_presym.MechanicalSystem`][].
 
     **Raises:**
 
@@ -105,20 +98,12 @@ def DissipativeHamiltonian(
     function returns values of the wrong shape.
     """
     eta1, eta2 = _as_damping(eta1, "`eta1`"), _as_damping(eta2, "`eta2`")
-    if separable:
-        kinetic = _ScaledKinetic(as_kinetic(kinetic), eta1, eta2)
-        return MechanicalSystem(kinetic, potential, eta2)
-    if isinstance(kinetic, AbstractKinetic) or not callable(kinetic):
-        raise ValueError(
-            "`DissipativeHamiltonian(..., separable=False)` needs `kinetic` to be a "
-            f"function `T(t, q, P, args)`, but got {kinetic!r}."
-        )
-    check_callable(potential, "potential", "f(t, q, args)")
-    return Hamiltonian(_ScaledEnergy(kinetic, potential, eta1, eta2), eta2)
+    kinetic = _ScaledKinetic(as_kinetic(kinetic), eta1, eta2)
+    return MechanicalSystem(kinetic, potential, eta2)
 
 
-def _as_damping(law, name: str) -> AbstractDamping:
-    mechanics = Mechanics(None, has_mass=False)
+def _as_damping(law, name: str) -> Damping:
+    mechanics = Mechanics(has_mass=False)
     parts = sum((x.parts(mechanics) for x in as_laws(law, name)), Parts())
     damping = one_rate(parts)
     return ConstantDamping(0.0) if damping is None else damping
@@ -127,8 +112,8 @@ def _as_damping(law, name: str) -> AbstractDamping:
 class _ScaledKinetic(AbstractKinetic):
     # exp(-eta1 - eta2) T(exp(eta2) p), as exp(eta2 - eta1) times the rescaled T.
     kinetic: AbstractKinetic
-    eta1: AbstractDamping
-    eta2: AbstractDamping
+    eta1: Damping
+    eta2: Damping
     is_autonomous: ClassVar[bool] = False
 
     @property
@@ -151,8 +136,8 @@ class _ScaledKinetic(AbstractKinetic):
         return tree_scale(scale, kinetic.velocity(t, p, args))
 
     def _by_eta1(self, p: PyTree) -> LinearFriction:
-        linear = self.eta1.parts(Mechanics(None, has_mass=False)).linear
-        friction = fit_friction(linear, Mechanics(None), p)
+        mechanics = Mechanics(has_mass=False)
+        friction = fit_friction(self.eta1.parts(mechanics).linear, mechanics, p)
         assert friction is not None
         return friction
 
@@ -168,23 +153,9 @@ class _ScaledKinetic(AbstractKinetic):
         if not self.is_quadratic:
             return integrate(self.velocity, friction, t, h, data, p, args)
         scale, displacement, decay = data
-        ((_, carried, _),) = displacement.leaves
-        dq = self.kinetic.velocity(t, tree_scale(scale * carried, p), args)
+        carried = scale * displacement.leaves.carried
+        dq = self.kinetic.velocity(t, tree_scale(carried, p), args)
         return dq, friction.decay(decay, p)
 
     def rescale(self, s: Scalar) -> "AbstractKinetic":
         return _ScaledKinetic(self.kinetic.rescale(s), self.eta1, self.eta2)
-
-
-class _ScaledEnergy(eqx.Module):
-    kinetic: Callable
-    potential: Callable
-    eta1: AbstractDamping
-    eta2: AbstractDamping
-
-    def __call__(self, t: Time, q: PyTree, p: PyTree, args: PyTree) -> Any:
-        at_q = CallableKinetic(lambda t, P, args: self.kinetic(t, q, P, args))
-        kinetic = _ScaledKinetic(at_q, self.eta1, self.eta2)(t, p, args)
-        potential = scalar_fn(self.potential, "The potential")(t, q, args)
-        with jax.numpy_dtype_promotion("standard"):
-            return kinetic + potential

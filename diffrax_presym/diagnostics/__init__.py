@@ -1,7 +1,6 @@
 """Measures of solutions and solvers: energy, structure, order, error against time."""
 
 from ._energy import (
-    canonical_energy as canonical_energy,
     energy as energy,
     energy_error as energy_error,
     energy_lost as energy_lost,
@@ -14,9 +13,7 @@ from ._plot import (
     plot_work_precision as plot_work_precision,
 )
 from ._structure import (
-    convergence_order as convergence_order,
     structure_defect as structure_defect,
-    volume_defect as volume_defect,
 )
 from ._work_precision import (
     work_precision as work_precision,

@@ -33,20 +33,6 @@ def energy(system: AbstractSystem, ts: Times, ys: State, args: PyTree = None) ->
     return _at_each(lambda t, y: system.energy(t, *y, args=args), ts, ys)
 
 
-def canonical_energy(
-    system: AbstractSystem, ts: Times, ys: State, args: PyTree = None
-) -> Times:
-    r"""The canonical energy $H = e^{\eta(t)} E(t, q, p)$, that of the paper.
-
-    It overflows where $e^{\eta}$ does.
-
-    **Arguments:**
-
-    As [`diffrax_presym.diagnostics.energy`][].
-    """
-    return _at_each(lambda t, y: system.canonical(t, *y, args=args), ts, ys)
-
-
 def energy_error(
     system: AbstractSystem, ts: Times, ys: State, args: PyTree = None
 ) -> Times:

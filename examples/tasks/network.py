@@ -21,7 +21,7 @@ for i, j in edges:
 system = dps.MechanicalSystem(
     dps.QuadraticKinetic(masses),
     dps.QuadraticPotential(jnp.asarray(stiffness)),
-    friction=dps.RayleighDamping(alpha, beta),
+    friction=[dps.ConstantDamping(alpha), dps.ViscousDamping(beta * stiffness)],
 )
 q0 = jnp.asarray(rng.normal(size=n))
 y0 = q0, jnp.zeros(n)

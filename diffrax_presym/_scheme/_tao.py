@@ -1,38 +1,18 @@
-"""Schemes with two copies of the system, explicit for any energy.
+"""The scheme of Tao, with two copies of the system, explicit for any energy.
 
 Each copy takes arguments from the other, and both share one moving frame. The state
 within a step is `y, (copy, field)`, with the velocity and force of the last exchange.
 """
 
-import math
-from typing import Any
-
-import diffrax as dfx
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Inexact, PyTree
+from jaxtyping import Array, Inexact, PyTree
 
-from .._compositions import stages
-from .._misc import (
-    as_parameter,
-    as_positive,
-    cast_to,
-    largest,
-    State,
-    tree_add,
-    tree_scale,
-)
+from .._misc import as_positive, cast_to, State, tree_add, tree_scale
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, Scheme
-from ._engine import AbstractMove, inverse, Outcome, Span, Stage, Stages
-from ._tableaus import (
-    SOFRONIOU_SPALETTA_6,
-    SOFRONIOU_SPALETTA_8,
-    SOFRONIOU_SPALETTA_10,
-    SUZUKI_4,
-)
+from ._engine import AbstractMove, Outcome, Span, Stage, Stages
 
 
 def paired_field(system: System, t: Array, y: State, copy: State) -> State:
@@ -109,66 +89,16 @@ class Coupling(AbstractMove):
         return self.apply(system, span, data, stage)
 
 
-class Separate(AbstractMove):
-    """From the mean and half of the difference, rotated, to two copies; the inverse
-    joins them."""
-
-    angle: Inexact[Array, ""]
-    scale: Inexact[Array, ""]
-
-    def prepare(self, system: System, span: Span) -> None:
-        return None
-
-    def _rotated(self, h: Array, half: State) -> State:
-        # Half of the angle before and half after, with the sign of `h`, for symmetry.
-        angle = jnp.copysign(cast_to(self.angle, h) / 2, h)
-        return rotate(angle, half, cast_to(self.scale, h))
-
-    def apply(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
-        y, half = stage
-        half = self._rotated(span.h, half)
-        y, copy = system.add(y, half), system.add(y, tree_scale(-1, half))
-        return (y, (copy, paired_field(system, span.t0, y, copy))), None
-
-    def undo(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
-        y, (copy, field) = stage
-        half = tree_scale(0.5, system.subtract(y, copy))
-        y = system.add(y, tree_scale(-1, half))
-        result = _distance_check(system, span.h, y, half, field)
-        return (y, self._rotated(span.h, half)), result
-
-
-def _distance_check(system: System, h: Array, y: State, half: State, field: State):
-    """A failure once the copies have parted.
-
-    They are separate trajectories, and their mean is none, if they are further from
-    each other than they are large, or move in a step: what oscillates passes zero.
-    """
-    state, rates = system.values(y), system.values(field)
-    with jax.numpy_dtype_promotion("standard"):
-        sizes = [
-            jnp.maximum(largest(x), jnp.abs(h) * largest(rate))
-            for x, rate in zip(state, rates, strict=True)
-        ]
-        # Rounding may be larger than what is at rest.
-        eps = max(float(jnp.finfo(x.dtype).eps) for x in sizes)
-        rounding = eps ** (1 / 3) * jnp.maximum(*sizes)
-        pairs = zip(half, sizes, strict=True)
-        q, p = (2 * largest(x) > jnp.maximum(size, rounding) for x, size in pairs)
-    failure: Any = dfx.RESULTS.nonlinear_divergence
-    return dfx.RESULTS.where(q | p, failure, dfx.RESULTS.successful)
-
-
-def rotate(angle: Array, y: State, scale: ArrayLike = 1.0) -> State:
-    """`q` and `p` rotated into each other, with `q` in units of `scale`.
+def rotate(angle: Array, y: State) -> State:
+    """`q` and `p` rotated into each other.
 
     Both are updated at once. Sequential updates would not be symplectic, although the
     energy would look right.
     """
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     q, p = y
-    q1 = tree_add(tree_scale(cos, q), sin * scale, p)
-    return q1, tree_add(tree_scale(cos, p), -sin / scale, q)
+    q1 = tree_add(tree_scale(cos, q), sin, p)
+    return q1, tree_add(tree_scale(cos, p), -sin, q)
 
 
 class PresymplecticTao(AbstractPresymplecticSolver):
@@ -185,8 +115,8 @@ class PresymplecticTao(AbstractPresymplecticSolver):
     original, and the `solver_state` holds the copy.
 
     The scheme of the paper for nonseparable Hamiltonians.
-    [`diffrax_presym.PresymplecticCoupled`][] is much more accurate at equal cost,
-    especially at higher orders, and has no coupling to choose.
+    [`diffrax_presym.PresymplecticGauss`][] is faster to almost any error, preserves the
+    structure in the phase space itself, and has no coupling to choose.
 
     ??? cite "Reference"
 
@@ -261,100 +191,7 @@ class PresymplecticTao(AbstractPresymplecticSolver):
                 "Inside a composition `PresymplecticTao` needs a coupling that does "
                 "not change with the step size, or the order is lost. Write "
                 "`PresymplecticTao(coupling)` with a few times the highest frequency "
-                "of the system, or `PresymplecticCoupled(order)`, which needs none."
+                "of the system, or `PresymplecticGauss(stages)`, which needs none."
             )
         moves = Stages(moves, table)
         return Scheme(moves, start=start, not_composable=not_composable)
-
-
-_WEIGHTS = {2: (1.0,)} | {
-    tableau.order: tableau.weights
-    for tableau in (
-        SUZUKI_4,
-        SOFRONIOU_SPALETTA_6,
-        SOFRONIOU_SPALETTA_8,
-        SOFRONIOU_SPALETTA_10,
-    )
-}
-
-
-def _check_order(order, name: str) -> int:
-    if order not in _WEIGHTS:
-        raise ValueError(
-            f"`{name}(order)` needs an order of 2, 4, 6, 8 or 10, but got {order!r}."
-        )
-    return order
-
-
-class PresymplecticCoupled(AbstractPresymplecticSolver):
-    r"""Two copies of the system, rotated about their mean once per composed step.
-
-    Order 2, 4, 6, 8 or 10 as given; 3, 11, 27, 43 or 71 evaluations of velocity and
-    force per step. Explicit for every energy, symmetric, and conformally
-    symplectic in the doubled phase space. Uses Hermite interpolation for dense/ts
-    output, at the cost of up to three more steps.
-
-    For energies that are neither separable nor split, explicitly.
-    [`diffrax_presym.PresymplecticTao`][] couples the copies within every stage, by a
-    strength that must suit both step and system. Here they are uncoupled for all stages
-    of a step. Then their difference, of the order of the local error, is rotated by a
-    fixed angle, so that it does not accumulate. The solution is their mean, which
-    depends on the difference only in second order. There is no strength to choose, and
-    no order is lost. The `solver_state` holds half of the difference. A solve fails,
-    with `RESULTS.nonlinear_divergence`, if the copies differ by more than their size,
-    or than they move in a step: the coupling is not stable with strong friction that is
-    part of the force. Then use shorter steps or
-    [`diffrax_presym.PresymplecticGauss`][].
-    """
-
-    composed_order: int = eqx.field(static=True)
-    angle: Inexact[Array, ""]
-    scale: Inexact[Array, ""]
-
-    def __init__(self, order: int = 2, angle=math.pi / 2, scale=1.0):
-        r"""**Arguments:**
-
-        - `order`: the order, 2, 4, 6, 8 or 10. Defaults to 2.
-        - `angle`: the angle by which the difference of the copies is rotated per step,
-            in radians. At multiples of $\pi$ it accumulates. Defaults to $\pi/2$.
-        - `scale`: the ratio of the sizes of `q` and `p`, which the rotation mixes. If
-            it is far off, only short steps are stable. Defaults to 1.
-
-        **Raises:**
-
-        `ValueError` if the order is not one of these, the angle is not a real number or
-        the scale is not positive.
-        """
-        self.composed_order = _check_order(order, "PresymplecticCoupled")
-        self.angle = as_parameter(angle, "`PresymplecticCoupled(angle=...)`")
-        self.scale = as_positive(scale, "`PresymplecticCoupled(scale=...)`")
-
-    @property
-    def is_symmetric(self) -> bool:
-        return True
-
-    def order(self, terms) -> int:
-        return self.composed_order
-
-    def scheme(self, system: System) -> Scheme:
-        frames = MoveFrames()
-        # The leapfrog of both copies, with arguments from each other. The next stage
-        # reuses the last field, since its arguments do not change.
-        moves = (
-            *(Exchange(known=True), frames, Exchange(second=True)),
-            *(frames, Exchange()),
-        )
-        table = [(0, 0, 0.5), (0, 0.5, 0.5), (0.5, 0.5, 1), (0.5, 1, 0.5), (1, 1, 0.5)]
-        weights = stages(_WEIGHTS[self.composed_order])
-        free = Stages([Stages(moves, table)], weights)
-        separate = Separate(self.angle, self.scale)
-        moves = separate, free, inverse(separate)
-        return Scheme(
-            Stages(moves, [(0, 0, 1), (0, 1, 1), (1, 1, 1)]),
-            start=lambda system, t, y: system.zeros(y),
-            not_composable=(
-                "`PresymplecticCoupled` composes its own stages, and rotates its "
-                "copies only at the ends of a step. Write "
-                "`PresymplecticCoupled(order)`."
-            ),
-        )

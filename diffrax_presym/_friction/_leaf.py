@@ -1,0 +1,120 @@
+"""Linear friction of one leaf: rates of its entries, or one that couples them."""
+
+import functools
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Inexact
+
+from .._forms import matvec
+from .._misc import as_time, cast_to, Scalar, Time
+from ._exponential import exponential_products, exponentials
+from ._log_scale import AbstractLogScale, by_quadrature, Effect, increment
+
+
+class EntryFriction(eqx.Module):
+    """Friction of a leaf by rates of its entries, of any log scales."""
+
+    terms: tuple[tuple[AbstractLogScale, Array], ...]
+
+    @property
+    def is_autonomous(self) -> bool:
+        return all(law.is_autonomous for law, _ in self.terms)
+
+    def prepare(self, t: Time, h: Time, order: int) -> Effect:
+        if len(self.terms) == 1:
+            ((law, rate),) = self.terms
+            return law.effect(rate, t, h, order)
+        return by_quadrature(self.terms, t, h, order)
+
+    def fix(self, effect: Effect) -> Effect:
+        return effect
+
+    def decay(self, effect: Effect, p: Array) -> Array:
+        return cast_to(effect.change, p) * p
+
+    def flow(self, effect: Effect, p: Array) -> tuple[Array, Array]:
+        return self.decay(effect, p), cast_to(effect.carried, p) * p
+
+    def respond(self, effect: Effect, force: Array) -> Array:
+        return cast_to(effect.responded, force) * force
+
+    def net_force(self, t: Time, force: Array, p: Array) -> Array:
+        rates = [(law, cast_to(rate, p), law.rate(t)) for law, rate in self.terms]
+        finite = lambda x: jnp.where(jnp.isinf(x), 0, x)
+        lost = sum(rate * cast_to(finite(x), p) for _, rate, x in rates)
+        net = force - lost * p
+        if self.is_singular(t) is None:
+            return net
+        singular = [jnp.isinf(x) & (rate != 0) for _, rate, x in rates]
+        strength = sum(
+            jnp.where(s, law.strength * rate, 0)
+            for (law, rate, _), s in zip(rates, singular, strict=True)
+        )
+        # Of motion from rest p grows like F t / (1 + gamma). No other has a limit.
+        limit = jnp.where(p == 0, force / (1 + strength), jnp.nan)
+        return jnp.where(functools.reduce(jnp.logical_or, singular), limit, net)
+
+    def amplification(self, t: Time, h: Time) -> Scalar:
+        return jnp.exp(jnp.max(increment(self.terms, t, h)))
+
+    def is_singular(self, t: Time) -> Bool[Array, ""] | None:
+        return reduce_any([law.is_singular(t) for law, _ in self.terms])
+
+
+class MatrixFriction(eqx.Module):
+    """Friction of a leaf by a constant matrix for each vector over its last axis."""
+
+    matrix: Inexact[Array, "*batch n n"]
+    is_autonomous = True
+
+    def prepare(self, t: Time, h: Time, order: int) -> Effect:
+        return Effect(*[as_time(h)] * 3)
+
+    def fix(self, effect: Effect) -> Effect:
+        x = effect.change
+        matrix = cast_to(self.matrix, x)
+        both = exponentials(matrix, jnp.ravel(x))
+        change, carried = (y.reshape(*x.shape, *matrix.shape) for y in both)
+        return Effect(change, carried, carried)
+
+    def flow(self, effect: Effect, p: Array) -> tuple[Array, Array]:
+        if jnp.ndim(effect.change):
+            change, carried = (matvec(cast_to(x, p), p) for x in effect[:2])
+            return change, carried
+        matrix, time = cast_to(self.matrix, p), cast_to(effect.change, p)
+        return exponential_products(matrix, time, p)
+
+    def decay(self, effect: Effect, p: Array) -> Array:
+        return self.flow(effect, p)[0]
+
+    def respond(self, effect: Effect, force: Array) -> Array:
+        return self.flow(effect, force)[1]
+
+    def net_force(self, t: Time, force: Array, p: Array) -> Array:
+        return force - matvec(cast_to(self.matrix, p), p)
+
+    def amplification(self, t: Time, h: Time) -> Scalar:
+        matrix = cast_to(self.matrix, h := as_time(h))
+        symmetric = (matrix + jnp.swapaxes(matrix, -1, -2)) / 2
+        # No more than this, by Gershgorin's circles, which compile in no time. Nothing
+        # of the size of the matrix depends on the span.
+        diagonal = jnp.diagonal(symmetric, axis1=-2, axis2=-1)
+        radius = jnp.sum(jnp.abs(symmetric), axis=-1) - jnp.abs(diagonal)
+        forwards, backwards = jnp.max(radius + diagonal), jnp.max(radius - diagonal)
+        return jnp.exp(jnp.where(h > 0, forwards, backwards) * jnp.abs(h))
+
+    def is_singular(self, t: Time) -> None:
+        return None
+
+
+def identity(vectors: Array) -> Array:
+    """The identity matrix for each vector over the last axis."""
+    size = vectors.shape[-1]
+    one = jnp.eye(size, dtype=vectors.dtype)
+    return jnp.broadcast_to(one, (*vectors.shape, size))
+
+
+def reduce_any(conditions: list[Bool[Array, ""] | None]) -> Bool[Array, ""] | None:
+    known = [x for x in conditions if x is not None]
+    return functools.reduce(jnp.logical_or, known) if known else None

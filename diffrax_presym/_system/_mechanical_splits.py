@@ -1,0 +1,180 @@
+"""The splits of mechanical systems."""
+
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import PyTree
+
+from .._compositions import lengths
+from .._friction._base import Linear
+from .._friction._drag import Drag
+from .._friction._fit import fit_friction
+from .._friction._log_scale import Linear as LinearScale
+from .._misc import State, Time, tree_add, tree_scale, tree_sum, tree_zeros, values
+from ._split import AbstractSplit
+
+
+if TYPE_CHECKING:
+    from ._bound import System
+
+
+def _potential_force(system: "System", t: Time, y: State) -> PyTree:
+    return system.term.potential.force(t, values(y)[0], system.args)
+
+
+def _flow(system: "System", t: Time, h: Time, data: PyTree, y: State) -> State:
+    """The flow of the kinetic energy and of linear friction."""
+    p = values(y)[1]
+    flow = system.term.kinetic.flow(system.friction, t, h, data, p, system.args)
+    return system.add(y, flow)
+
+
+class KineticSplit(AbstractSplit):
+    """The drift is the flow of the kinetic energy, and the kick that of the
+    potential."""
+
+    kinds: frozenset[str] = eqx.field(static=True)
+
+    def __init__(self, is_quadratic: bool):
+        nystrom = {"nystrom"} if is_quadratic else set()
+        self.kinds = frozenset({"separable", "any"} | nystrom)
+
+    def prepare(self, system, t, h, order) -> PyTree:
+        return system.term.kinetic.prepare(system.friction, t, h, order)
+
+    def drift(self, system, t, h, data, y) -> State:
+        return _flow(system, t, h, data, y)
+
+    def force(self, system, t, y) -> PyTree:
+        return _potential_force(system, t, y)
+
+
+class LocalSplit(AbstractSplit):
+    """The same with friction that depends on place or speed, which is part of the kick:
+    exact if it is linear, otherwise a composition."""
+
+    kinds: frozenset[str] = eqx.field(static=True, default=frozenset({"any"}))
+
+    def prepare(self, system, t, h, order) -> PyTree:
+        return system.term.kinetic.prepare(system.friction, t, h, order)
+
+    def drift(self, system, t, h, data, y) -> State:
+        return _flow(system, t, h, data, y)
+
+    def force(self, system, t, y) -> PyTree:
+        """The force, and the numbers of the friction at the place."""
+        parts, at = system.term.parts, (t, values(y)[0], system.args)
+        forms = [jtu.tree_map(jnp.asarray, part.form(*at)) for part in parts.local]
+        drags = [drag.at(*at) for drag in parts.drags]
+        numbers = [(drag.coefficient, drag.medium) for drag in drags]
+        return _potential_force(system, t, y), forms, numbers
+
+    def kick(self, system, t, h, y, force, order) -> State:
+        (force, forms, numbers), p = force, values(y)[1]
+        parts, mechanics = system.term.parts, system.term.mechanics
+        pairs = zip(parts.local, forms, strict=True)
+        linear = [Linear(LinearScale(), x, part.per_velocity) for part, x in pairs]
+        friction = fit_friction(linear, mechanics, p)
+        where = lambda drag: (drag.coefficient, drag.medium)
+        pairs = zip(parts.drags, numbers, strict=True)
+        drags = [eqx.tree_at(where, *pair, is_leaf=_is_none) for pair in pairs]
+
+        def pushed(dp: PyTree, h: Time) -> PyTree:
+            if friction is None:
+                return tree_add(dp, h, force)
+            data = friction.prepare(t, h, order)
+            gained = friction.decay(data, tree_sum(p, dp))
+            return tree_sum(dp, tree_sum(gained, friction.respond(data, force)))
+
+        def slowed(drags: list[Drag], dp: PyTree, h: Time) -> PyTree:
+            for drag in drags:
+                dp = tree_sum(dp, drag.decay(h, tree_sum(p, dp), mechanics.mass))
+            return dp
+
+        def stage(dp: PyTree, h: Time) -> tuple[PyTree, None]:
+            dp = pushed(slowed(drags, dp, h / 2), h)
+            return slowed(drags[::-1], dp, h / 2), None
+
+        if drags:
+            dp = lax.scan(stage, tree_zeros(p), lengths(order, h))[0]
+        else:
+            dp = pushed(tree_zeros(p), h)
+        return system.add(y, (None, dp))
+
+
+_is_none = lambda x: x is None
+
+
+class PotentialSplit(AbstractSplit):
+    """The drift is the flow of a quadratic potential, and the kick that of the
+    kinetic energy: positions and momenta in swapped roles."""
+
+    kinds: frozenset[str] = eqx.field(
+        static=True, default=frozenset({"any", "nystrom"})
+    )
+
+    def prepare(self, system, t, h, order) -> PyTree:
+        friction = system.friction
+        return None if friction is None else friction.prepare(t, h, order)
+
+    def drift(self, system, t, h, data, y) -> State:
+        force = _potential_force(system, t, y)
+        if system.friction is None:
+            return system.add(y, (None, tree_scale(h, force)))
+        gained = system.friction.respond(data, force)
+        return system.add(system.decay(data, y), (None, gained))
+
+    def force(self, system, t, y) -> PyTree:
+        return system.velocity(t, y)
+
+    def kick(self, system, t, h, y, force, order) -> State:
+        return system.add(y, (tree_scale(h, force), None))
+
+
+class SharedSplit(AbstractSplit):
+    r"""Half of the friction on positions and half on momenta, which leaves a force.
+
+    With $q = e^{-\eta / 2} x$ the motion is
+    $M x'' = e^{\eta / 2} F + (\eta'^2 / 4 + \eta'' / 2) M x$. The pair is $q$ and
+    $p + \eta' M q / 2$, which are $e^{-\eta / 2}$ times $x$ and $M x'$; `enter` and
+    `leave` go from $(q, p)$ to it and back.
+    """
+
+    kinds: frozenset[str] = eqx.field(static=True, default=frozenset({"shared"}))
+
+    def times_mass(self, system: "System", x: PyTree) -> PyTree:
+        return system.term.kinetic.momentum(values(x))
+
+    def _shift(self, system: "System", t: Time, y: State, sign: float) -> State:
+        law = system.one_rate
+        if law is None:
+            return y
+        shift = tree_scale(sign * law.rate(t), self.times_mass(system, y[0]))
+        return system.add(y, (None, shift))
+
+    def enter(self, system: "System", t: Time, y: State) -> State:
+        return self._shift(system, t, y, 0.5)
+
+    def leave(self, system: "System", t: Time, z: State) -> State:
+        return self._shift(system, t, z, -0.5)
+
+    def prepare(self, system, t, h, order) -> PyTree:
+        law = system.one_rate
+        return None if law is None else jnp.expm1(-law.increment(t, h) / 2)
+
+    def drift(self, system, t, h, data, y) -> State:
+        y = system.add(y, (tree_scale(h, system.velocity(t, y)), None))
+        # From the frame of the start of the span to that of its end.
+        return y if data is None else system.add(y, tree_scale(data, values(y)))
+
+    def force(self, system, t, y) -> PyTree:
+        force, law = _potential_force(system, t, y), system.one_rate
+        if law is None:
+            return force
+        rate, change = jax.jvp(law.rate, (t,), (jnp.ones_like(t),))
+        mass = self.times_mass(system, y[0])
+        return tree_add(force, rate * rate / 4 + change / 2, mass)
