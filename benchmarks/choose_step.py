@@ -76,7 +76,7 @@ def measure(problem, ts, table):
             continue
         seconds = time.perf_counter() - start
         got = scaled(run(step.dt0).ys, exact, rtol)
-        cost = sum(n for n, _ in step.trials) / step.steps
+        cost = sum(trial.steps for trial in step.trials) / step.steps
         cells = step.error * rtol, got * rtol, got, step.order, cost, seconds
         table.row(problem.name, rtol, str(step.steps), *cells)
         yield got, got / step.error
