@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ._misc import cast_to
+from ._numbers import cast_to
 
 
 def mirror(*half: float) -> tuple[float, ...]:

@@ -6,7 +6,8 @@ import jax.tree_util as jtu
 import lineax as lx
 from jaxtyping import Array, PyTree
 
-from ._misc import as_finite, as_positive, cast_to
+from ._checks import as_finite, as_positive
+from ._numbers import cast_to
 
 
 _MASSLESS = (

@@ -1,4 +1,3 @@
-import abc
 import functools
 import math
 
@@ -6,31 +5,13 @@ import diffrax as dfx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
-from ._misc import cast_to
-
-
-class AbstractStepInterpolation(dfx.AbstractLocalInterpolation):
-    """The interpolation of a step, as a function of the fraction of the step."""
-
-    @abc.abstractmethod
-    def at_fraction(self, s: Array) -> PyTree:
-        """The value at a fraction from 0 to 1."""
-
-    def evaluate(self, t0, t1=None, left: bool = True) -> PyTree:
-        del left
-        if t1 is not None:
-            start, end = self.evaluate(t0), self.evaluate(t1)
-            return jtu.tree_map(lambda a, b: b - a, start, end)
-        # A step of zero length, as in an empty solve, evaluates to its start.
-        length = self.t1 - self.t0
-        empty = length == 0
-        s = jnp.where(empty, 0, (t0 - self.t0) / jnp.where(empty, 1, length))
-        return self.at_fraction(s)
+from . import _tree as tree
+from ._numbers import cast_to
 
 
-class HermiteInterpolation(AbstractStepInterpolation):
+class HermiteInterpolation(dfx.AbstractLocalInterpolation):
     """Hermite interpolation of a step, from values and derivatives at several points.
 
     Exact at both ends. From the two ends alone it is cubic, with an error of fourth
@@ -48,7 +29,14 @@ class HermiteInterpolation(AbstractStepInterpolation):
     # Values and derivatives at the points of `inner_points`, stacked.
     inner: tuple[PyTree, PyTree] | None = None
 
-    def at_fraction(self, s: Array) -> PyTree:
+    def evaluate(self, t0, t1=None, left: bool = True) -> PyTree:
+        del left
+        if t1 is not None:
+            return tree.sub(self.evaluate(t1), self.evaluate(t0))
+        # A step of zero length, as in an empty solve, evaluates to its start.
+        length = self.t1 - self.t0
+        empty = length == 0
+        s = jnp.where(empty, 0, (t0 - self.t0) / jnp.where(empty, 1, length))
         ends = self.y0, self.y1, self.k0, self.k1
         inner = () if self.inner is None else self.inner
         return jtu.tree_map(lambda *x: _hermite(cast_to(s, x[0]), *x), *ends, *inner)

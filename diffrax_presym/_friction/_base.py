@@ -8,7 +8,7 @@ import equinox as eqx
 import lineax as lx
 from jaxtyping import Array, Inexact, PyTree
 
-from .._misc import Time
+from .._numbers import Time
 from ._log_scale import AbstractLogScale
 
 

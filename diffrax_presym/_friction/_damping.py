@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
+from .. import _tree as tree
+from .._checks import as_finite
 from .._forms import multiply
-from .._misc import as_finite, as_time, cast_to, Time, tree_scale, tree_sum
+from .._numbers import as_time, cast_to, Time
 from ._base import AbstractFriction, Linear as LinearPart, Mechanics, Parts
 from ._log_scale import (
     AbstractLogScale,
@@ -40,7 +42,7 @@ class Damping(AbstractFriction):
         return Parts(tuple(LinearPart(*term) for term in self.terms))
 
     def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
-        return multiply(tree_scale(-1, self.rate(t)), p, "The damping", "p")
+        return multiply(tree.scale(-1, self.rate(t)), p, "The damping", "p")
 
     def _sum(self, values: Callable) -> Numbers:
         def term(law: AbstractLogScale, factor: Numbers) -> Numbers:
@@ -67,7 +69,7 @@ def _add(x: Numbers, y: Numbers) -> Numbers:
     is_leaf = lambda x: jtu.treedef_is_leaf(jtu.tree_structure(x))
     if is_leaf(x):
         return jtu.tree_map(lambda yi: x + yi, y)
-    return jtu.tree_map(lambda xi: xi + y, x) if is_leaf(y) else tree_sum(x, y)
+    return jtu.tree_map(lambda xi: xi + y, x) if is_leaf(y) else tree.sum(x, y)
 
 
 def as_numbers(x, name: str) -> Numbers:

@@ -8,7 +8,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Inexact, PyTree
 
 from .._forms import fit_form, is_operator
-from .._misc import cast_to, Time
+from .._numbers import cast_to, Time
 from ._base import AbstractFriction, MASS, Mechanics, Parts
 from ._damping import as_numbers, Numbers
 from ._viscous import needs_mass

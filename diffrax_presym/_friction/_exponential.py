@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
 from .._forms import matvec
-from .._misc import cast_to
+from .._numbers import cast_to
 
 
 Numbers = Inexact[Array, "..."]

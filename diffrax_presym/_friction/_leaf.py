@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Inexact
 
 from .._forms import matvec
-from .._misc import as_time, cast_to, Scalar, Time
+from .._numbers import as_time, cast_to, Scalar, Time
 from ._exponential import exponential_products, exponentials
 from ._log_scale import AbstractLogScale, by_quadrature, Effect, increment
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, PyTree
 
-from .._misc import Scalar, Time
+from .._numbers import Scalar, Time
 from ._leaf import EntryFriction, MatrixFriction, reduce_any
 
 

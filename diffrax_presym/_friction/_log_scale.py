@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact
 
-from .._misc import as_time, cast_to, Scalar, Time
+from .._numbers import as_time, cast_to, Scalar, Time
 from ._exponential import expm1, expm1_ratio, gauss_legendre
 
 

@@ -2,8 +2,9 @@ from collections.abc import Callable
 
 from jaxtyping import PyTree
 
+from .. import _tree as tree
 from .._forms import multiply
-from .._misc import Time, tree_scale
+from .._numbers import Time
 from ._base import AbstractFriction, DAMPING, Local, Mechanics, Parts
 
 
@@ -52,4 +53,4 @@ class PositionDamping(AbstractFriction):
 
     def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
         rate = self.rate(t, q, args)
-        return tree_scale(-1, multiply(rate, p, DAMPING, "p"))
+        return tree.scale(-1, multiply(rate, p, DAMPING, "p"))

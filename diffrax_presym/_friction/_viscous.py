@@ -5,8 +5,9 @@ from typing import Any
 
 from jaxtyping import PyTree
 
+from .. import _tree as tree
 from .._forms import as_form, is_operator, multiply
-from .._misc import Time, tree_scale
+from .._numbers import Time
 from ._base import (
     AbstractFriction,
     COEFFICIENTS,
@@ -113,4 +114,4 @@ class ViscousDamping(AbstractFriction):
     def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
         form: Any = self.coefficients
         form = form(t, q, args) if self.is_local else form
-        return tree_scale(-1, multiply(form, v, COEFFICIENTS, "v"))
+        return tree.scale(-1, multiply(form, v, COEFFICIENTS, "v"))

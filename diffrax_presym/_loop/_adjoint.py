@@ -9,7 +9,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .._misc import as_positive
+from .._checks import as_positive
 from .._scheme._base import AbstractPresymplecticSolver
 from .._system._bound import bind
 from . import _diffrax as private

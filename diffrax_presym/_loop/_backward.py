@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Int, PyTree
 
-from .._misc import tree_sum, tree_zeros
+from .. import _tree as tree
 from .._scheme._base import advance, Point, Scheme
 from .._scheme._engine import prepare, Span, vjp, vjp_step
 from ._run import end_is_separate, Problem, Trace
@@ -29,7 +29,7 @@ class Position(eqx.Module):
 
     def add(self, gradient: PyTree, bar: PyTree) -> "Position":
         where = lambda x: (x.gradient, x.bar)
-        new = tree_sum((self.gradient, self.bar), (gradient, bar))
+        new = tree.sum((self.gradient, self.bar), (gradient, bar))
         return eqx.tree_at(where, self, new, is_leaf=lambda x: x is None)
 
 
@@ -80,9 +80,9 @@ class Backward(eqx.Module):
         at = Position(
             n,
             point,
-            (tree_zeros(point[0]), self.carry_bar),
-            tree_zeros(moved),
-            tree_zeros(eqx.filter(self.shared, eqx.is_inexact_array)),
+            (tree.zeros(point[0]), self.carry_bar),
+            tree.zeros(moved),
+            tree.zeros(eqx.filter(self.shared, eqx.is_inexact_array)),
             [jnp.sum(rows.reached(n)) for rows in problem.rows],
         )
         pulls = []
@@ -94,9 +94,9 @@ class Backward(eqx.Module):
             pull = partial(self._pull_row, i)
             if len(rows) and problem.at_once:
                 more, starts = self._pull_rows(i)
-                at = at.add(more, tree_zeros(at.bar))
+                at = at.add(more, tree.zeros(at.bar))
                 pull = lambda at, j, starts=starts: (
-                    tree_zeros(at.gradient),
+                    tree.zeros(at.gradient),
                     jtu.tree_map(lambda x: x[j], starts),
                 )
             pulls.append(pull)
@@ -111,7 +111,7 @@ class Backward(eqx.Module):
         if self.shared is None:
             return at
         gradient = self._pull_prepared(self.problem.prepare, at.shared)
-        return at.add(gradient, tree_zeros(at.bar))
+        return at.add(gradient, tree.zeros(at.bar))
 
     def back_to(
         self, at: Position, pulls: list[Callable], first: Array, start: Callable
@@ -174,14 +174,14 @@ class Backward(eqx.Module):
             args = system, wanted, span, data, start, at.bar
             more, prepared, bar = vjp(moves, *args)
         moved, _ = self._parameters
-        gradient = tree_sum(at.gradient, (more, tree_zeros(moved[1])))
+        gradient = tree.sum(at.gradient, (more, tree.zeros(moved[1])))
         shared = at.shared
         if once:
             prepared = eqx.filter(prepared, eqx.is_inexact_array)
-            shared = tree_sum(shared, prepared)
+            shared = tree.sum(shared, prepared)
         else:
             fn = lambda system: prepare(moves, system, span)
-            gradient = tree_sum(gradient, self._pull_prepared(fn, prepared))
+            gradient = tree.sum(gradient, self._pull_prepared(fn, prepared))
         return Position(n, start, bar, gradient, shared, at.left)
 
     def _pull_prepared(self, fn: Callable, bar: PyTree) -> PyTree:
@@ -210,7 +210,7 @@ class Backward(eqx.Module):
             return eqx.filter(fns[i](t, y, system.args), eqx.is_inexact_array)
 
         gradient, y_bar = jax.vjp(output, moved, y)[1](bar)
-        return gradient, (y_bar, tree_zeros(carry))
+        return gradient, (y_bar, tree.zeros(carry))
 
     def _pull_row(self, i: int, at: Position, j: Array):
         """Pull back one row of an output, from the start of its step."""

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
-from .._misc import all_finite, largest, tree_sub
+from .. import _tree as tree
 from ._backward import Backward, Position
 from ._run import Problem
 
@@ -71,13 +71,13 @@ def _by_reversal(adjoint: Any, backward: Backward, places: Array) -> Position:
     # Positions and momenta are compared in units of their largest values. The
     # solver state may be pure rounding, and is not compared.
     units = jtu.tree_map(
-        lambda x, y: jnp.maximum(largest(x), largest(y)),
+        lambda x, y: jnp.maximum(tree.largest(x), tree.largest(y)),
         *(problem.start[0], at.point[0]),
     )
 
     def size(y):
         scaled = jtu.tree_map(
-            lambda x, u: (largest(x) / jnp.where(u > 0, u, 1)).astype(float),
+            lambda x, u: (tree.largest(x) / jnp.where(u > 0, u, 1)).astype(float),
             *(y, units),
         )
         return jtu.tree_reduce(jnp.maximum, scaled)
@@ -87,7 +87,7 @@ def _by_reversal(adjoint: Any, backward: Backward, places: Array) -> Position:
         j, end = j - 1, at.point[0]
         known = jtu.tree_map(lambda x: x[j], trace.kept)
         at = backward.back_to(at, pulls, places[j], lambda n: None)
-        miss = size(tree_sub(at.point[0], known[0]))
+        miss = size(tree.sub(at.point[0], known[0]))
         miss = miss / jnp.maximum(size(known[0]), size(end))
         at = eqx.tree_at(lambda at: at.point, at, known)
         return at, jnp.maximum(worst, miss), j
@@ -112,7 +112,7 @@ def _by_reversal(adjoint: Any, backward: Backward, places: Array) -> Position:
             '`FixedStepAdjoint("checkpoints")`.',
         )
     # A solve that diverged has a gradient of NaN anyway.
-    missed = ~(miss <= limit(adjoint, at.point[0])[0]) & all_finite(trace.end[0])
+    missed = ~(miss <= limit(adjoint, at.point[0])[0]) & tree.all_finite(trace.end[0])
     return eqx.error_if(
         at,
         missed,

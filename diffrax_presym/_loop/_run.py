@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Int, PyTree
 
-from .._misc import all_finite, cast_to, tree_where
+from .. import _tree as tree
+from .._numbers import cast_to
 from .._scheme._base import (
     AbstractPresymplecticSolver,
     advance,
@@ -99,7 +100,7 @@ class Problem(eqx.Module):
         if self.at_once:
             # Under `jax.vmap` a `lax.cond` computes both, and copies what both share,
             # such as matrices of friction, for each row.
-            return tree_where(inside, shorter(), y)
+            return tree.where(inside, shorter(), y)
         return lax.cond(inside, shorter, lambda: y)
 
     def output(self, i: int, parameters: Parameters, j: Array, start: Point) -> PyTree:
@@ -108,7 +109,7 @@ class Problem(eqx.Module):
         if rows.may_be_inside:
             at = rows.stop[j], start, rows.time[j], rows.inside[j]
             y = self.between(system, *at)
-        return fns[i](rows.time[j], y, system.args), all_finite(y)
+        return fns[i](rows.time[j], y, system.args), tree.all_finite(y)
 
     def outputs(
         self, i: int, parameters: Parameters, starts: PyTree, n: Array
@@ -128,7 +129,7 @@ class Problem(eqx.Module):
             within = lambda: each(stop, starts, time, inside)
             ys = lax.cond(jnp.any(inside), within, lambda: starts[0])
         values = jax.vmap(lambda t, y: fns[i](t, y, system.args))(time, ys)
-        return values, jax.vmap(all_finite)(ys)
+        return values, jax.vmap(tree.all_finite)(ys)
 
 
 class Progress(eqx.Module):
@@ -183,7 +184,7 @@ def run(problem: Problem, keep: Array | None = None):
         kept = Track(keep, keep <= last, last + 1, value, problem.start)
     progress, (stacked, kept) = _walk(problem, (tracks, kept))
 
-    saved, finite, starts = [], all_finite(progress.point[0]), []
+    saved, finite, starts = [], tree.all_finite(progress.point[0]), []
     for i, rows in enumerate(problem.rows):
         values = None
         starts.append(stacked[i] if problem.at_once else None)

@@ -7,7 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._misc import as_finite, cast_to
+from .._checks import as_finite
+from .._numbers import cast_to
 from .._scheme._engine import Span
 from .._system._bound import System
 

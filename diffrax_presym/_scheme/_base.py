@@ -9,8 +9,9 @@ import jax.lax as lax
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
+from .. import _tree as tree
 from .._interpolation import HermiteInterpolation, inner_points
-from .._misc import all_finite, cast_to, State, tree_scale
+from .._numbers import cast_to, State
 from .._system._base import check_state
 from .._system._bound import bind, NONFINITE, System, unwrap
 from ._engine import first_failure, forward, Moves, prepare, Result, Span
@@ -103,7 +104,7 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver):
         start = y0, carry
         end, result = advance(scheme, system, span, start)
         finite = dfx.RESULTS.where(
-            all_finite(end[0]), dfx.RESULTS.successful, NONFINITE
+            tree.all_finite(end[0]), dfx.RESULTS.successful, NONFINITE
         )
         info = dense_info(self, scheme, system, span, start, end)
         result = first_failure(result, finite)
@@ -150,7 +151,7 @@ def dense_info(
     t0, t1, h = span
     slope = lambda t, x: system.slope(t, x[0], scheme.end_force(x[1]))
     y0, y1 = (system.values(x[0]) for x in (start, end))
-    k0, k1 = (tree_scale(h, slope(*x)) for x in ((t0, start), (t1, end)))
+    k0, k1 = (tree.scale(h, slope(*x)) for x in ((t0, start), (t1, end)))
     info = dict(y0=y0, y1=y1, k0=k0, k1=k1)
     # The order of a scheme does not depend on the term.
     number = _INNER_POINTS[bisect.bisect_left(_ORDERS, solver.order(None))]
@@ -160,7 +161,7 @@ def dense_info(
     def at(fraction):
         t = t0 + fraction * h
         y = between(scheme, system, t0, start, t)
-        return y, tree_scale(h, system.slope(t, y))
+        return y, tree.scale(h, system.slope(t, y))
 
     return info | dict(inner=lax.map(at, cast_to(inner_points(number), h)))
 

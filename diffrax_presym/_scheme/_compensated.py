@@ -1,7 +1,8 @@
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
-from .._misc import State, Sum
+from .. import _tree as tree
+from .._numbers import State
 from .._system._base import AbstractSystem
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, check_base, Point, Scheme
@@ -30,11 +31,8 @@ class Compensated(AbstractPresymplecticSolver):
         @article{moller1965quasi,
             author={M{\\o}ller, Ole},
             title={Quasi double-precision in floating point addition},
-            journal={BIT Numerical Mathematics},
-            volume={5},
-            pages={37--50},
-            year={1965},
-        }
+            journal={BIT Numerical Mathematics}, volume={5}, pages={37--50},
+            year={1965}}
         ```
     """
 
@@ -70,8 +68,8 @@ class Compensated(AbstractPresymplecticSolver):
         moves = enter, base.moves, inverse(enter)
 
         def start(system: System, t: Array, y: State) -> PyTree:
-            lost = system.zeros(y)
-            return base.start(system, t, jtu.tree_map(Sum, y, lost)), lost
+            lost = tree.zeros(y)
+            return base.start(system, t, jtu.tree_map(tree.Sum, y, lost)), lost
 
         def between(system: System, t0: Array, start: Point, t: Array) -> State:
             assert base.between is not None

@@ -119,23 +119,14 @@ def SuzukiYoshida(
         @article{yoshida1990construction,
             author={Yoshida, Haruo},
             title={Construction of higher order symplectic integrators},
-            journal={Physics Letters A},
-            volume={150},
-            number={5-7},
-            pages={262--268},
-            year={1990},
-        }
-
+            journal={Physics Letters A}, volume={150}, number={5-7}, pages={262--268},
+            year={1990}}
         @article{suzuki1990fractal,
             author={Suzuki, Masuo},
             title={Fractal decomposition of exponential operators with applications to
-                   many-body theories and {M}onte {C}arlo simulations},
-            journal={Physics Letters A},
-            volume={146},
-            number={6},
-            pages={319--323},
-            year={1990},
-        }
+                many-body theories and {M}onte {C}arlo simulations},
+            journal={Physics Letters A}, volume={146}, number={6}, pages={319--323},
+            year={1990}}
         ```
     """
     if not isinstance(order, int) or order < 2 or order % 2 != 0:
@@ -175,12 +166,8 @@ def PresymplecticYoshida4(
         @article{forest1990fourth,
             author={Forest, Etienne and Ruth, Ronald D.},
             title={Fourth-order symplectic integration},
-            journal={Physica D: Nonlinear Phenomena},
-            volume={43},
-            number={1},
-            pages={105--117},
-            year={1990},
-        }
+            journal={Physica D: Nonlinear Phenomena}, volume={43}, number={1},
+            pages={105--117}, year={1990}}
         ```
     """
     base = PresymplecticLeapfrog(first, root_finder, root_find_max_steps)
@@ -247,13 +234,8 @@ def SofroniouSpaletta(
         @article{sofroniou2005derivation,
             author={Sofroniou, Mark and Spaletta, Giulia},
             title={Derivation of symmetric composition constants for symmetric
-                   integrators},
-            journal={Optimization Methods and Software},
-            volume={20},
-            number={4-5},
-            pages={597--613},
-            year={2005},
-        }
+                integrators}, journal={Optimization Methods and Software}, volume={20},
+            number={4-5}, pages={597--613}, year={2005}}
         ```
     """
     if order not in SOFRONIOU_SPALETTA:

@@ -20,8 +20,9 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from .. import _tree as tree
 from .._friction._linear import Effects
-from .._misc import cast_to, tree_sum, tree_zeros
+from .._numbers import cast_to
 from .._system._bound import System
 
 
@@ -174,12 +175,6 @@ def forward(
     return _walk(act, moves, span, data, stage)[:2]
 
 
-def undo(moves: Moves, system: System, span: Span, back: PyTree, stage: Stage) -> Stage:
-    """The state at the start of the span, from that at its end."""
-    act = lambda move, span, back, stage: move.undo(system, span.reversed, back, stage)
-    return _walk(act, moves, span, back, stage, reverse=True)[0]
-
-
 def vjp(
     moves: Moves,
     system: System,
@@ -222,9 +217,9 @@ def vjp_step(
         data, back = both
         start, _ = move.undo(system, span.reversed, back, end)
         more, prepared, bar = vjp(move, system, wanted, span, data, start, bar)
-        return (start, tree_sum(gradient, more), bar), None, prepared
+        return (start, tree.sum(gradient, more), bar), None, prepared
 
-    state = end, tree_zeros(eqx.filter(system, wanted)), bar
+    state = end, tree.zeros(eqx.filter(system, wanted)), bar
     (start, gradient, bar), _, prepared = _walk(
         back, moves, span, both, state, reverse=True
     )

@@ -5,7 +5,7 @@ from typing import Literal
 import equinox as eqx
 import optimistix as optx
 
-from .._misc import check_root_finder
+from .._checks import check_root_finder
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, Scheme
 from ._engine import inverse, Stages

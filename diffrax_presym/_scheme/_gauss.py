@@ -10,19 +10,10 @@ import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import Array, Inexact, PyTree
 
+from .. import _tree as tree
+from .._checks import check_root_finder
 from .._friction._linear import Effects
-from .._misc import (
-    cast_to,
-    check_root_finder,
-    from_sums,
-    rounding_errors,
-    State,
-    to_sums,
-    tree_scale,
-    tree_sub,
-    tree_where,
-    tree_zeros,
-)
+from .._numbers import cast_to, State
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, Scheme
 from ._collocation import gauss_table, GaussTable, legendre, MAX_STAGES
@@ -90,13 +81,13 @@ class GaussStep(eqx.Module):
             outwards, inwards = both
             p = system.move_frame(outwards, p)
             velocity, force = system.velocity_and_force(t, (q, p))
-            return tree_scale(weight, (velocity, system.move_frame(inwards, force)))
+            return tree.scale(weight, (velocity, system.move_frame(inwards, force)))
 
         weights = cast_to(self.table.weights, self.h) * self.h
         return jax.vmap(one)(self.times, weights, both, *stages)
 
     def residual(self, slopes: Slopes) -> Slopes:
-        return tree_sub(self.slopes(self.stages(slopes)), slopes)
+        return tree.sub(self.slopes(self.stages(slopes)), slopes)
 
 
 class Collocation(AbstractMove):
@@ -129,8 +120,8 @@ class Collocation(AbstractMove):
         self, system: System, span: Span, data: Frames | None, stage: Stage
     ) -> Outcome:
         y, carry = stage
-        sums = to_sums(y, carry.lost)
-        values, lost = system.values(sums), rounding_errors(sums)
+        sums = tree.to_sums(y, carry.lost)
+        values, lost = system.values(sums), tree.rounding_errors(sums)
         to_middle = None if data is None else data.to_middle
         move = lambda y: (y[0], system.move_frame(to_middle, y[1]))
         frame = self.number, data, span.t0, span.h
@@ -139,8 +130,8 @@ class Collocation(AbstractMove):
         sums = system.add(sums, _change(system, data, slopes, values[1]))
         # The solution depends on none of it, except by rounding.
         h = cast_to(span.h, carry.h)
-        carry = lax.stop_gradient(_Carry(rounding_errors(sums), slopes, h))
-        return (from_sums(sums, y), carry), result
+        carry = lax.stop_gradient(_Carry(tree.rounding_errors(sums), slopes, h))
+        return (tree.from_sums(sums, y), carry), result
 
     def undo(
         self, system: System, span: Span, data: Frames | None, stage: Stage
@@ -165,9 +156,9 @@ class Collocation(AbstractMove):
             # Backwards in time the slopes are those of this step.
             # About the decay from the middle of the last step.
             moved = jax.vmap(lambda p: system.move_frame(data.whole, p))(p)
-            p = tree_where(ratio > 0, moved, p)
+            p = tree.where(ratio > 0, moved, p)
         guess = jtu.tree_map(lambda x: _dot(matrix, x), (q, p))
-        return tree_where(known, guess, tree_zeros(guess))
+        return tree.where(known, guess, tree.zeros(guess))
 
     def _solve(self, step: GaussStep, guess: Slopes):
         if self.root_finder is None:
@@ -236,23 +227,13 @@ class PresymplecticGauss(AbstractPresymplecticSolver):
         @article{antonana2017reducing,
             author={Anto{\~n}ana, Mikel and Makazaga, Joseba and Murua, Ander},
             title={Reducing and monitoring round-off error propagation for symplectic
-                   implicit {R}unge--{K}utta schemes},
-            journal={Numerical Algorithms},
-            volume={76},
-            number={4},
-            pages={861--880},
-            year={2017},
-        }
-
+                implicit {R}unge--{K}utta schemes}, journal={Numerical Algorithms},
+            volume={76}, number={4}, pages={861--880}, year={2017}}
         @article{hairer2008achieving,
             author={Hairer, Ernst and McLachlan, Robert I. and Razakarivony, Alain},
             title={Achieving {B}rouwer's law with implicit {R}unge--{K}utta methods},
-            journal={BIT Numerical Mathematics},
-            volume={48},
-            number={2},
-            pages={231--243},
-            year={2008},
-        }
+            journal={BIT Numerical Mathematics}, volume={48}, number={2},
+            pages={231--243}, year={2008}}
         ```
 
         and the evaluation of all stages at once after
@@ -261,11 +242,8 @@ class PresymplecticGauss(AbstractPresymplecticSolver):
         @misc{antonana2025simd,
             author={Anto{\~n}ana, Mikel and Makazaga, Joseba and Murua, Ander},
             title={{SIMD}-vectorized implicit symplectic integrators can outperform
-                   explicit symplectic ones},
-            year={2025},
-            eprint={2511.03655},
-            archivePrefix={arXiv},
-        }
+                explicit symplectic ones}, year={2025}, eprint={2511.03655},
+            archivePrefix={arXiv}}
         ```
     """
 
@@ -339,7 +317,7 @@ class PresymplecticGauss(AbstractPresymplecticSolver):
             y = system.values(y)
             many = lambda x: jnp.zeros((self.stages, *x.shape), x.dtype)
             zero = jnp.zeros((), jnp.result_type(t))
-            return _Carry(tree_zeros(y), jtu.tree_map(many, y), zero)
+            return _Carry(tree.zeros(y), jtu.tree_map(many, y), zero)
 
         return Scheme(move, start=start, is_implicit=True)
 

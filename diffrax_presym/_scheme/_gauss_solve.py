@@ -11,7 +11,7 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Inexact, PyTree, Shaped
 
-from .._misc import largest, tree_scale, tree_sub, tree_sum, tree_zeros
+from .. import _tree as tree
 from ._moves import RootFind
 
 
@@ -146,7 +146,7 @@ def fixed_point(step: Equations, guess: Slopes, max_iterations: int, tolerance: 
 
 def by_root_finder(step: Equations, guess: Slopes, find: RootFind):
     # Extrapolation of stiff components may be inaccurate.
-    sizes = (largest(step.residual(x)) for x in (guess, tree_zeros(guess)))
+    sizes = (tree.largest(step.residual(x)) for x in (guess, tree.zeros(guess)))
     better = jnp.less(*sizes)
     guess = jtu.tree_map(lambda x: jnp.where(better, x, 0), guess)
     return find(lambda slopes: step.slopes(step.stages(slopes)), guess)
@@ -177,19 +177,19 @@ def contract(g, y: Slopes) -> Slopes:
         # x = x + g(x) - b
         def iterate(state):
             x, _, least, stalled, count = state
-            new = tree_sub(tree_sum(x, g(x)), b)
-            change, size = largest(tree_sub(new, x)), largest(new)
+            new = tree.sub(tree.sum(x, g(x)), b)
+            change, size = tree.largest(tree.sub(new, x)), tree.largest(new)
             stalled = jnp.where(change < least, 0, stalled + 1)
             # A contraction that rotates may grow for some iterations.
             going = (change > eps / 8 * size) & (stalled < 10)
             return new, going, jnp.minimum(change, least), stalled, count + 1
 
-        start = tree_scale(-1, b)
+        start = tree.scale(-1, b)
         eps = float(jnp.finfo(_lowest(b)).eps)
         state = (
             start,
             jnp.array(True),
-            jnp.asarray(jnp.inf, largest(b).dtype),
+            jnp.asarray(jnp.inf, tree.largest(b).dtype),
             jnp.asarray(0),
             jnp.asarray(0),
         )
@@ -197,7 +197,7 @@ def contract(g, y: Slopes) -> Slopes:
             lambda state: state[1] & (state[-1] < 200), iterate, state
         )
         # Never numbers as if nothing had happened.
-        solved = ~going & (least <= eps ** (1 / 2) * largest(x))
+        solved = ~going & (least <= eps ** (1 / 2) * tree.largest(x))
         return jtu.tree_map(lambda x: jnp.where(solved, x, jnp.nan), x)
 
     return lax.custom_linear_solve(g, y, solve, transpose_solve=solve)

@@ -11,7 +11,7 @@ import equinox as eqx
 import optimistix as optx
 from jaxtyping import PyTree
 
-from .._misc import rounding_errors, to_sums, tree_scale, tree_sub
+from .. import _tree as tree
 from .._system._bound import System
 from ._engine import AbstractMove, Outcome, Span, Stage
 
@@ -88,7 +88,7 @@ def root_find(root_finder: optx.AbstractRootFinder | None, max_steps: int) -> Ro
     def find(fn: Callable, guess: PyTree) -> tuple[PyTree, dfx.RESULTS]:
         assert root_finder is not None  # the scheme has checked that there is one
         solution = optx.root_find(
-            lambda x, _: tree_sub(fn(x), x),
+            lambda x, _: tree.sub(fn(x), x),
             root_finder,
             guess,
             max_steps=max_steps,
@@ -111,7 +111,7 @@ class FrozenKick(AbstractMove):
 
     def _by(self, force: PyTree, system: System, span: Span, stage: Stage) -> Outcome:
         y, carry = stage
-        y = system.add(y, (None, tree_scale(span.h, force)))
+        y = system.add(y, (None, tree.scale(span.h, force)))
         return (y, None if carry is None else force), None
 
     def apply(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
@@ -122,8 +122,8 @@ class FrozenKick(AbstractMove):
             return self._by(system.force(span.t0, y), system, span, stage)
         after = lambda dp: system.add(y, (None, dp))
         find = root_find(self.root_finder, self.max_steps)
-        kick = lambda dp: tree_scale(span.h, system.force(span.t0, after(dp)))
-        dp, result = find(kick, system.zeros(y[1]))
+        kick = lambda dp: tree.scale(span.h, system.force(span.t0, after(dp)))
+        dp, result = find(kick, tree.zeros(y[1]))
         return (after(dp), carry), result
 
     def undo(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
@@ -142,15 +142,15 @@ class FrozenDrift(AbstractMove):
     def apply(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
         y, carry = stage
         velocity = system.velocity(span.t0, y)
-        y = system.add(y, (tree_scale(span.h, velocity), None))
+        y = system.add(y, (tree.scale(span.h, velocity), None))
         return (system.decay(data, y), carry), None
 
     def undo(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
         y, carry = stage
         y = system.decay(data, y)
         after = lambda dq: system.add(y, (dq, None))
-        drift = lambda dq: tree_scale(span.h, system.velocity(span.t1, after(dq)))
-        nothing = system.zeros(y[0])
+        drift = lambda dq: tree.scale(span.h, system.velocity(span.t1, after(dq)))
+        nothing = tree.zeros(y[0])
         if system.is_separable:
             return (after(drift(nothing)), carry), None
         find = root_find(self.root_finder, self.max_steps)
@@ -169,8 +169,8 @@ class ToSums(AbstractMove):
 
     def apply(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
         y, (carry, lost) = stage
-        return (to_sums(y, lost), carry), None
+        return (tree.to_sums(y, lost), carry), None
 
     def undo(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
         y, carry = stage
-        return (system.values(y), (carry, rounding_errors(y))), None
+        return (system.values(y), (carry, tree.rounding_errors(y))), None

@@ -10,21 +10,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Inexact, PyTree
 
-from .._misc import (
-    cast_to,
-    from_sums,
-    is_sum,
-    rounding_errors,
-    State,
-    Sum,
-    to_sums,
-    tree_add,
-    tree_scale,
-    tree_sub,
-    tree_where,
-    tree_zeros,
-    values,
-)
+from .. import _tree as tree
+from .._numbers import cast_to, State
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, advance, Point, Scheme
 from ._engine import AbstractMove, forward, Outcome, prepare, Span, Stage
@@ -49,7 +36,7 @@ class _Carry(NamedTuple):
     # momentum at their end, from which a gradient by reversal goes back.
     p_lost: PyTree
     # In the variables of the shared split, in the frame of the end of the last step:
-    momentum: PyTree[Sum]  # the mean over the step
+    momentum: PyTree[tree.Sum]  # the mean over the step
     force: PyTree  # at the end of the step
     filter: PyTree[Inexact[Array, "lags ..."]]  # the state of the filter of forces
     dropped: Inexact[Array, ""]  # how many times a history was dropped
@@ -94,21 +81,21 @@ class Multistep(AbstractMove):
         known = lax.stop_gradient(_known(data, span, old))
         starting = known < table.order - 1
         lasting = old.count > table.order - 1
-        nothing = tree_zeros(old.p_lost)
-        lost = old.q_lost, tree_where(lasting, nothing, old.p_lost)
-        q, p = to_sums(y, lost)
+        nothing = tree.zeros(old.p_lost)
+        lost = old.q_lost, tree.where(lasting, nothing, old.p_lost)
+        q, p = tree.to_sums(y, lost)
         # A kick by the filtered force, and a drift.
         newest = float(table.forces[0])
         kick = jtu.tree_map(lambda s, f: s[0] + newest * f, old.filter, old.force)
-        z = system.add((q, old.momentum), (None, tree_scale(h, kick)))
+        z = system.add((q, old.momentum), (None, tree.scale(h, kick)))
         z = split.drift(system, t0, h, data.decay, z)
 
         def start(_):
             # The same from a step of the other scheme.
             (first, _), _ = self._one_step(system, span, data, (q, p))
-            change = system.subtract(first[0], decay(q))
-            mean = tree_scale(1 / h, split.times_mass(system, change))
-            kick = tree_scale(1 / h, tree_sub(mean, decay(values(old.momentum))))
+            change = tree.sub(first[0], decay(q))
+            mean = tree.scale(1 / h, split.times_mass(system, change))
+            kick = tree.scale(1 / h, tree.sub(mean, decay(tree.values(old.momentum))))
             return _stack((*first, _as_sums(mean), _as_sums(kick)))
 
         # In the frame of the end of the step, as that of its start may not exist.
@@ -121,30 +108,30 @@ class Multistep(AbstractMove):
             later = jnp.concatenate([s[1:], jnp.zeros_like(s[:1])])
             return later + (_outer(B, force) - _outer(R, kick))
 
-        filter = jtu.tree_map(remember, decay(old.filter), force, values(kick))
+        filter = jtu.tree_map(remember, decay(old.filter), force, tree.values(kick))
         force = split.force(system, t1, (q, momentum))
         p1 = self._momentum(system, t1, h, q, momentum, force, filter)
-        kept = tree_where(known == table.order - 1, values(p), old.p_lost)
-        p_lost = rounding_errors(first_p)
-        p1 = tree_where(starting, (values(first_p), p_lost), (p1, nothing))
-        p1 = jtu.tree_map(Sum, *p1)
-        lost = rounding_errors(q), tree_where(starting, p_lost, kept)
+        kept = tree.where(known == table.order - 1, tree.values(p), old.p_lost)
+        p_lost = tree.rounding_errors(first_p)
+        p1 = tree.where(starting, (tree.values(first_p), p_lost), (p1, nothing))
+        p1 = jtu.tree_map(tree.Sum, *p1)
+        lost = tree.rounding_errors(q), tree.where(starting, p_lost, kept)
         # Of a history that is not used any more the end of the step knows nothing.
         dropped = (known < old.count) & (old.count >= table.order)
         new = _Carry(
             *(known + 1, cast_to(h, old.h), *lost, momentum, force, filter),
             old.dropped + jnp.where(dropped, 1, 0),
         )
-        return (from_sums((q, p1), y), new), None
+        return (tree.from_sums((q, p1), y), new), None
 
     def undo(self, system: System, span: Span, data: _Data, stage: Stage) -> Outcome:
         (y, new), (t1, t0, h), table = stage, span, self.table
         split, decay = system.split("shared"), _decay(data)
         known = new.count - 1
         starting = known < table.order - 1
-        nothing = tree_zeros(new.p_lost)
-        lost = new.q_lost, tree_where(starting, new.p_lost, nothing)
-        q, p = to_sums(y, lost)
+        nothing = tree.zeros(new.p_lost)
+        lost = new.q_lost, tree.where(starting, new.p_lost, nothing)
+        q, p = tree.to_sums(y, lost)
         z = split.drift(system, t1, h, data.decay, (q, new.momentum))
         force = split.force(system, t0, z)
         # The oldest force and kick have left the filter, so its last entry is known.
@@ -156,10 +143,10 @@ class Multistep(AbstractMove):
             return jnp.concatenate([(kick - float(B[0]) * force)[None], s[:-1]])
 
         filter = jtu.tree_map(forget, filter, force, kick)
-        _, momentum = system.add(z, (None, tree_scale(h, kick)))
+        _, momentum = system.add(z, (None, tree.scale(h, kick)))
         p0 = self._momentum(system, t0, -h, z[0], momentum, force, filter)
         first_step = known == table.order - 1
-        p0 = tree_where(first_step, new.p_lost, p0)
+        p0 = tree.where(first_step, new.p_lost, p0)
 
         def start(_):
             # It is symmetric: a step backwards undoes it.
@@ -170,14 +157,14 @@ class Multistep(AbstractMove):
         taken = _either(starting, start, lambda taken: taken, taken)
         q, p = _unstack(taken)
         # The rounding error of a momentum not computed by the one-step scheme is zero.
-        kept = tree_where(starting | first_step, rounding_errors(p), new.p_lost)
-        lost = rounding_errors(q), kept
+        kept = tree.where(starting | first_step, tree.rounding_errors(p), new.p_lost)
+        lost = tree.rounding_errors(q), kept
         # In the steps at the start the first entry of the filter, which is not used
         # there, is not that of before.
         history = momentum, force, filter
         count, length = jnp.maximum(known, 0), cast_to(-h, new.h)
         old = _Carry(count, length, *lost, *history, new.dropped)
-        return (from_sums((q, p), y), old), None
+        return (tree.from_sums((q, p), y), old), None
 
     def _momentum(self, system, t, h, q, momentum, force, filter) -> PyTree:
         """The mechanical momentum at the end of a step."""
@@ -187,7 +174,7 @@ class Multistep(AbstractMove):
             return sum(w * x for w, x in zip(weights, (*s, force), strict=True))
 
         gained = jtu.tree_map(gain, filter, force)
-        z = values(q), tree_add(values(momentum), h, gained)
+        z = tree.values(q), tree.add(tree.values(momentum), h, gained)
         return system.split("shared").leave(system, t, z)[1]
 
 
@@ -205,27 +192,27 @@ def _decay(data: _Data) -> Callable:
     """From the frame of the start of the span to that of its end."""
     if data.decay is None:
         return lambda x: x
-    return lambda x: tree_add(x, data.decay, values(x))
+    return lambda x: tree.add(x, data.decay, tree.values(x))
 
 
 def _outer(column: np.ndarray, x: Array) -> Array:
     return cast_to(column, x).reshape(-1, *(1,) * x.ndim) * x[None]
 
 
-def _stack(sums: tuple[PyTree[Sum], ...]) -> PyTree:
+def _stack(sums: tuple[PyTree[tree.Sum], ...]) -> PyTree:
     """Several trees of sums as one tree of arrays."""
     leaf = lambda *x: jnp.stack([y for s in x for y in (s.value, s.lost)])
-    return jtu.tree_map(leaf, *sums, is_leaf=is_sum)
+    return jtu.tree_map(leaf, *sums, is_leaf=tree.is_sum)
 
 
-def _unstack(rows: PyTree) -> list[PyTree[Sum]]:
+def _unstack(rows: PyTree) -> list[PyTree[tree.Sum]]:
     count = len(jtu.tree_leaves(rows)[0])
-    pair = lambda i: jtu.tree_map(lambda x: Sum(x[i], x[i + 1]), rows)
+    pair = lambda i: jtu.tree_map(lambda x: tree.Sum(x[i], x[i + 1]), rows)
     return [pair(i) for i in range(0, count, 2)]
 
 
-def _as_sums(x: PyTree) -> PyTree[Sum]:
-    return jtu.tree_map(lambda x: Sum(x, jnp.zeros_like(x)), x)
+def _as_sums(x: PyTree) -> PyTree[tree.Sum]:
+    return jtu.tree_map(lambda x: tree.Sum(x, jnp.zeros_like(x)), x)
 
 
 def _either(condition: Bool[Array, ""], if_true: Callable, if_false: Callable, x: Any):
@@ -279,21 +266,12 @@ class SymmetricMultistep(AbstractPresymplecticSolver):
         @article{quinlan1990symmetric,
             author={Quinlan, Gerald D. and Tremaine, Scott},
             title={Symmetric multistep methods for the numerical integration of
-                   planetary orbits},
-            journal={The Astronomical Journal},
-            volume={100},
-            number={5},
-            pages={1694--1700},
-            year={1990},
-        }
-
+                planetary orbits}, journal={The Astronomical Journal}, volume={100},
+            number={5}, pages={1694--1700}, year={1990}}
         @misc{quinlan1999resonances,
             author={Quinlan, Gerald D.},
             title={Resonances and instabilities in symmetric multistep methods},
-            year={1999},
-            eprint={astro-ph/9901136},
-            archivePrefix={arXiv},
-        }
+            year={1999}, eprint={astro-ph/9901136}, archivePrefix={arXiv}}
         ```
     """
 
@@ -334,7 +312,7 @@ class SymmetricMultistep(AbstractPresymplecticSolver):
         count = self.multistep_order - 2
 
         def start(system: System, t: Array, y: State) -> _Carry:
-            nothing = system.zeros(y[1])
+            nothing = tree.zeros(y[1])
             many = lambda x: jnp.zeros((count, *x.shape), x.dtype)
             zero = jnp.zeros((), jnp.result_type(t))
             history = _as_sums(nothing), nothing, jtu.tree_map(many, nothing)

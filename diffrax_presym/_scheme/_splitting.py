@@ -174,12 +174,8 @@ class Strang(AbstractSplitting):
         @article{strang1968construction,
             author={Strang, Gilbert},
             title={On the construction and comparison of difference schemes},
-            journal={SIAM Journal on Numerical Analysis},
-            volume={5},
-            number={3},
-            pages={506--517},
-            year={1968},
-        }
+            journal={SIAM Journal on Numerical Analysis}, volume={5}, number={3},
+            pages={506--517}, year={1968}}
         ```
     """
 
@@ -202,13 +198,9 @@ class BlanesMoan4(AbstractSplitting):
         @article{blanes2002practical,
             author={Blanes, Sergio and Moan, Per Christian},
             title={Practical symplectic partitioned {R}unge--{K}utta and
-                   {R}unge--{K}utta--{N}ystr{\\"o}m methods},
-            journal={Journal of Computational and Applied Mathematics},
-            volume={142},
-            number={2},
-            pages={313--330},
-            year={2002},
-        }
+                {R}unge--{K}utta--{N}ystr{\\"o}m methods},
+            journal={Journal of Computational and Applied Mathematics}, volume={142},
+            number={2}, pages={313--330}, year={2002}}
         ```
     """
 
@@ -273,15 +265,11 @@ class BlanesCasasRKN8(AbstractSplitting):
 
         ```bibtex
         @misc{blanes2022symmetric,
-            author={Blanes, Sergio and Casas, Fernando and
-                    Escorihuela-Tom{\\`a}s, Alejandro},
+            author={Blanes, Sergio and Casas, Fernando and Escorihuela-Tom{\\`a}s,
+                Alejandro},
             title={{R}unge--{K}utta--{N}ystr{\\"o}m symplectic splitting methods of
-                   order 8},
-            year={2022},
-            eprint={2202.01541},
-            archivePrefix={arXiv},
-            primaryClass={math.NA},
-        }
+                order 8}, year={2022}, eprint={2202.01541}, archivePrefix={arXiv},
+            primaryClass={math.NA}}
         ```
     """
 

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact, PyTree
 
-from .._misc import as_positive, cast_to, State, tree_add, tree_scale
+from .. import _tree as tree
+from .._checks import as_positive
+from .._numbers import cast_to, State
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, Scheme
 from ._engine import AbstractMove, Outcome, Span, Stage, Stages
@@ -45,7 +47,7 @@ class Exchange(AbstractMove):
 
     def _by(self, field: State, system: System, span: Span, stage: Stage) -> Stage:
         y, (copy, carried) = stage
-        velocity, force = tree_scale(span.h, field)
+        velocity, force = tree.scale(span.h, field)
         if self.second:
             y, copy = system.add(y, (velocity, None)), system.add(copy, (None, force))
             return y, (copy, carried)
@@ -80,9 +82,9 @@ class Coupling(AbstractMove):
 
     def apply(self, system: System, span: Span, data: Array, stage: Stage) -> Outcome:
         y, (copy, field) = stage
-        half = tree_scale(0.5, system.subtract(y, copy))
-        change = tree_add(rotate(data, half), -1, half)
-        copy = system.add(copy, tree_scale(-1, change))
+        half = tree.scale(0.5, tree.sub(y, copy))
+        change = tree.add(rotate(data, half), -1, half)
+        copy = system.add(copy, tree.scale(-1, change))
         return (system.add(y, change), (copy, field)), None
 
     def undo(self, system: System, span: Span, data: Array, stage: Stage) -> Outcome:
@@ -97,8 +99,8 @@ def rotate(angle: Array, y: State) -> State:
     """
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     q, p = y
-    q1 = tree_add(tree_scale(cos, q), sin, p)
-    return q1, tree_add(tree_scale(cos, p), -sin, q)
+    q1 = tree.add(tree.scale(cos, q), sin, p)
+    return q1, tree.add(tree.scale(cos, p), -sin, q)
 
 
 class PresymplecticTao(AbstractPresymplecticSolver):
@@ -126,13 +128,8 @@ class PresymplecticTao(AbstractPresymplecticSolver):
         @article{tao2016explicit,
             author={Tao, Molei},
             title={Explicit symplectic approximation of nonseparable {H}amiltonians:
-                   Algorithm and long time performance},
-            journal={Physical Review E},
-            volume={94},
-            number={4},
-            pages={043303},
-            year={2016},
-        }
+                Algorithm and long time performance}, journal={Physical Review E},
+            volume={94}, number={4}, pages={043303}, year={2016}}
         ```
     """
 

@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
-from .._misc import as_positive, cast_to, describe, Scalar
+from .._checks import as_positive, describe
+from .._numbers import cast_to, Scalar
 from .._system._base import AbstractSystem
 
 
@@ -40,12 +41,8 @@ class StepDensityController(dfx.AbstractStepSizeController):
         @article{hairer2005explicit,
             author={Hairer, Ernst and S{\"o}derlind, Gustaf},
             title={Explicit, time reversible, adaptive step size control},
-            journal={SIAM Journal on Scientific Computing},
-            volume={26},
-            number={6},
-            pages={1838--1851},
-            year={2005},
-        }
+            journal={SIAM Journal on Scientific Computing}, volume={26}, number={6},
+            pages={1838--1851}, year={2005}}
         ```
     """
 

@@ -7,22 +7,13 @@ import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import Array, Bool, Inexact, PyTree
 
+from .. import _tree as tree
+from .._checks import describe, match
 from .._friction._base import AbstractFriction, Mechanics, Parts
 from .._friction._damping import Damping
 from .._friction._fit import fit_friction, one_rate
 from .._friction._linear import LinearFriction
-from .._misc import (
-    as_time,
-    describe,
-    match,
-    Scalar,
-    State,
-    Time,
-    tree_scale,
-    tree_sub,
-    tree_sum,
-    tree_zeros,
-)
+from .._numbers import as_time, Scalar, State, Time
 from ._split import AbstractSplit
 
 
@@ -78,7 +69,7 @@ class AbstractSystem(dfx.AbstractTerm):
         """The state `y` displaced by `dy`, of which either part may be `None`: a sum,
         or a step on a manifold. Solvers update states by it alone."""
         return tuple(  # pyright: ignore[reportReturnType]
-            x if dx is None else tree_sum(x, dx) for x, dx in zip(y, dy, strict=True)
+            x if dx is None else tree.sum(x, dx) for x, dx in zip(y, dy, strict=True)
         )
 
     def is_valid(
@@ -119,7 +110,7 @@ class AbstractSystem(dfx.AbstractTerm):
         return t1 - t0
 
     def prod(self, vf: State, control) -> State:
-        return tree_scale(control, vf)
+        return tree.scale(control, vf)
 
     # Friction, and other forces.
 
@@ -136,11 +127,11 @@ class AbstractSystem(dfx.AbstractTerm):
         not part of drifts, and a user's force `external(t, q, v, args)`."""
         for law in self.laws:
             if not law.parts(self.mechanics).linear:
-                force = tree_sum(force, law.force(t, q, p, v, args))
+                force = tree.sum(force, law.force(t, q, p, v, args))
         if external is None:
             return force
         value = external(t, q, v, args)
-        return tree_sum(force, match(value, q, "`force`", "`q`"))
+        return tree.sum(force, match(value, q, "`force`", "`q`"))
 
     def fit_friction(self, p: P) -> LinearFriction | None:
         """The linear friction that depends on time alone, for momenta like `p`."""
@@ -149,7 +140,7 @@ class AbstractSystem(dfx.AbstractTerm):
     def friction_force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         """The force of all friction."""
         v, friction = self.velocity(t, q, p, args), self.fit_friction(p)
-        force = self.add_forces(tree_zeros(p), None, t, q, p, v, args)
+        force = self.add_forces(tree.zeros(p), None, t, q, p, v, args)
         return force if friction is None else friction.net_force(t, force, p)
 
     @property
@@ -171,15 +162,15 @@ class AbstractSystem(dfx.AbstractTerm):
         `p` is the mechanical momentum, as in a solution.
         """
         energy = self.energy(t, q, p, args)
-        return tree_scale(jnp.exp(self.log_scale(t)), energy)
+        return tree.scale(jnp.exp(self.log_scale(t)), energy)
 
     def to_canonical(self, t: Time, p: P) -> P:
         r"""From the mechanical momentum to the canonical, $P = e^{\eta(t)} p$."""
-        return tree_scale(jnp.exp(self.log_scale(t)), p)
+        return tree.scale(jnp.exp(self.log_scale(t)), p)
 
     def from_canonical(self, t: Time, P: P) -> P:
         r"""From the canonical momentum to the mechanical, $p = e^{-\eta(t)} P$."""
-        return tree_scale(jnp.exp(-self.log_scale(t)), P)
+        return tree.scale(jnp.exp(-self.log_scale(t)), P)
 
     def from_velocity(self, t: Time, y: tuple[Q, Q], args: PyTree = None) -> State:
         """The state `(q, p)` of positions and velocities `(q, v)`."""
@@ -214,7 +205,7 @@ def check_state(y: PyTree) -> None:
 def momentum_of(system: AbstractSystem, t: Time, q: Q, v: Q, args: PyTree) -> State:
     """The state of positions and velocities, by Newton's method from the momentum that
     is equal to the velocity."""
-    residual = lambda p, _: tree_sub(system.velocity(t, q, p, args), v)
+    residual = lambda p, _: tree.sub(system.velocity(t, q, p, args), v)
     eps = max(float(jnp.finfo(x.dtype).eps) for x in jtu.tree_leaves(v))
     finder = optx.Newton(rtol=10 * eps, atol=10 * eps)
     return q, optx.root_find(residual, finder, v).value

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, PyTree
 
+from .. import _tree as tree
 from .._friction._damping import Damping
 from .._friction._linear import LinearFriction
-from .._misc import cast_to, State, Time, tree_sub, tree_zeros, values
+from .._numbers import cast_to, State, Time
 from ._base import AbstractSystem
 
 
@@ -34,7 +35,7 @@ class System(eqx.Module):
 
     def __init__(self, term: AbstractSystem, args: PyTree, direction, y: State):
         self.term, self.args, self.direction = term, args, direction
-        self.friction = term.fit_friction(values(y)[1])
+        self.friction = term.fit_friction(tree.values(y)[1])
 
     def time(self, t: ArrayLike) -> Array:
         """The physical time, which runs backwards where `direction` is -1."""
@@ -46,17 +47,9 @@ class System(eqx.Module):
         """The state displaced by `dy`, of which either part may be `None`."""
         return self.term.add(y, dy)
 
-    def subtract(self, x: PyTree, y: PyTree) -> PyTree:
-        """The difference of two states, or parts of these, as arrays."""
-        return tree_sub(x, y)
-
     def values(self, x: _T) -> _T:
         """The arrays of a state, or part of one."""
-        return values(x)
-
-    def zeros(self, x: PyTree) -> PyTree:
-        """Arrays of zeros like a state, or part of one."""
-        return tree_zeros(values(x))
+        return tree.values(x)
 
     # The vector field.
 
@@ -67,19 +60,19 @@ class System(eqx.Module):
 
     def velocity(self, t: Time, y: State) -> PyTree:
         """The velocity, which is the derivative of `q`."""
-        return self.term.velocity(t, *values(y), self.args)
+        return self.term.velocity(t, *tree.values(y), self.args)
 
     def force(self, t: Time, y: State) -> PyTree:
         """The force on `p`, without linear friction."""
-        return self.term.force(t, *values(y), self.args)
+        return self.term.force(t, *tree.values(y), self.args)
 
     def velocity_and_force(self, t: Time, y: State) -> State:
         """The vector field without linear friction."""
-        return self.term.velocity_and_force(t, *values(y), self.args)
+        return self.term.velocity_and_force(t, *tree.values(y), self.args)
 
     def slope(self, t: Time, y: State, force: PyTree | None = None) -> State:
         """The full vector field, with friction. Reuses a given force."""
-        y = values(y)
+        y = tree.values(y)
         if force is None:
             velocity, force = self.velocity_and_force(t, y)
         else:
@@ -90,7 +83,7 @@ class System(eqx.Module):
 
     def check(self, t: Time, y: State) -> dfx.RESULTS | None:
         """A failure where the energy is not defined; `None` if that is not checked."""
-        valid = self.term.is_valid(t, *values(y), self.args)
+        valid = self.term.is_valid(t, *tree.values(y), self.args)
         if valid is None:
             return None
         return dfx.RESULTS.where(valid, dfx.RESULTS.successful, NONFINITE)
@@ -105,7 +98,7 @@ class System(eqx.Module):
         """The momentum in the frame of the end of a span: friction alone."""
         if self.friction is None:
             return y
-        return self.add(y, (None, self.friction.decay(data, values(y[1]))))
+        return self.add(y, (None, self.friction.decay(data, tree.values(y[1]))))
 
     def move_frame(self, data: PyTree, p: PyTree) -> PyTree:
         """The same for momenta alone, or forces, as arrays."""

@@ -5,22 +5,10 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Bool, PyTree
 
+from .. import _tree as tree
+from .._checks import check_callable, match, scalar_fn
 from .._friction._base import AbstractFriction
-from .._misc import (
-    all_finite,
-    check_callable,
-    match,
-    Scalar,
-    scalar_fn,
-    State,
-    Time,
-    tree_add,
-    tree_dot,
-    tree_scale,
-    tree_sub,
-    tree_sum,
-    values,
-)
+from .._numbers import Scalar, State, Time
 from ._base import AbstractSystem, P, Q
 from ._mirror import AbstractMirrorMap
 from ._scaling import AbstractScaling
@@ -42,17 +30,17 @@ class BregmanSplit(AbstractSplit):
         return friction.prepare(t, h, order)
 
     def drift(self, system, t, h, data, y) -> State:
-        mirror, (q, p) = system.term.mirror_map, values(y)
+        mirror, (q, p) = system.term.mirror_map, tree.values(y)
         friction: Any = system.friction
-        dq = tree_scale(-1, friction.decay(data, mirror.step(q, p)))
+        dq = tree.scale(-1, friction.decay(data, mirror.step(q, p)))
         if mirror.is_quadratic:
             return system.add(y, (dq, friction.decay(data, p)))
         # A drift leaves grad h(q) + p constant.
-        change = tree_scale(-1, mirror.change(q, dq))
+        change = tree.scale(-1, mirror.change(q, dq))
         return system.add(y, (dq, mirror.project(change)))
 
     def force(self, system, t, y) -> PyTree:
-        return system.term.potential_force(t, values(y)[0], system.args)
+        return system.term.potential_force(t, tree.values(y)[0], system.args)
 
 
 class BregmanHamiltonian(AbstractSystem):
@@ -132,17 +120,17 @@ class BregmanHamiltonian(AbstractSystem):
 
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         h, step = self.mirror_map, self.mirror_map.step(q, p)
-        end = tree_sum(q, step)
+        end = tree.sum(q, step)
         # D_h*(grad h(q) + p, grad h(q)) is D_h(q, m).
-        divergence = h(q) - h(end) + tree_dot(tree_sum(h.gradient(q), p), step)
+        divergence = h(q) - h(end) + tree.dot(tree.sum(h.gradient(q), p), step)
         objective = scalar_fn(self.objective, "The objective")(t, q, args)
-        kinetic = tree_scale(self.scaling.rate(t), divergence)
-        potential = tree_scale(self.scaling.strength(t), objective)
+        kinetic = tree.scale(self.scaling.rate(t), divergence)
+        potential = tree.scale(self.scaling.strength(t), objective)
         with jax.numpy_dtype_promotion("standard"):
             return kinetic + potential
 
     def velocity(self, t: Time, q: Q, p: P, args: PyTree = None) -> Q:
-        return tree_scale(self.scaling.rate(t), self.mirror_map.step(q, p))
+        return tree.scale(self.scaling.rate(t), self.mirror_map.step(q, p))
 
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         force = self.potential_force(t, q, args)
@@ -151,8 +139,8 @@ class BregmanHamiltonian(AbstractSystem):
         step = self.mirror_map.step(q, p)
         # The kinetic part depends on q too: its force is p - hess h(q) (m - q).
         _, change = jax.jvp(self.mirror_map.gradient, (q,), (step,))
-        kinetic = self.mirror_map.project(tree_sub(p, change))
-        return tree_add(force, self.scaling.rate(t), kinetic)
+        kinetic = self.mirror_map.project(tree.sub(p, change))
+        return tree.add(force, self.scaling.rate(t), kinetic)
 
     def potential_force(self, t: Time, q: Q, args: PyTree = None) -> P:
         """The force of the objective."""
@@ -161,11 +149,11 @@ class BregmanHamiltonian(AbstractSystem):
             slope = jax.grad(objective, argnums=1)(t, q, args)
         else:
             slope = match(self.gradient_fn(t, q, args), q, "`gradient`", "`q`")
-        return tree_scale(-self.scaling.strength(t), self.mirror_map.project(slope))
+        return tree.scale(-self.scaling.strength(t), self.mirror_map.project(slope))
 
     def is_valid(
         self, t: Time, q: Q, p: P, args: PyTree = None
     ) -> Bool[Array, ""] | None:
-        valid = self.mirror_map.contains(q) & all_finite(p)
+        valid = self.mirror_map.contains(q) & tree.all_finite(p)
         conditions = self.scaling.is_valid(t)
         return valid if conditions is None else valid & conditions

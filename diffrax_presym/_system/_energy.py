@@ -3,16 +3,11 @@ from collections.abc import Callable
 import jax
 from jaxtyping import Array, Bool, PyTree
 
+from .. import _tree as tree
+from .._checks import check_callable, scalar_fn
 from .._friction._base import AbstractFriction
 from .._friction._damping import as_laws
-from .._misc import (
-    all_finite,
-    check_callable,
-    Scalar,
-    scalar_fn,
-    Time,
-    tree_scale,
-)
+from .._numbers import Scalar, Time
 from ._base import AbstractSystem, P, Q
 from ._split import AbstractSplit
 
@@ -91,10 +86,10 @@ class Hamiltonian(AbstractSystem):
         self, t: Time, q: Q, p: P, args: PyTree = None
     ) -> tuple[Q, P]:
         slope, velocity = jax.grad(self.energy, argnums=(1, 2))(t, q, p, args)
-        force, state = tree_scale(-1, slope), (t, q, p, velocity, args)
+        force, state = tree.scale(-1, slope), (t, q, p, velocity, args)
         return velocity, self.add_forces(force, self.external, *state)
 
     def is_valid(
         self, t: Time, q: Q, p: P, args: PyTree = None
     ) -> Bool[Array, ""] | None:
-        return all_finite((q, p))
+        return tree.all_finite((q, p))

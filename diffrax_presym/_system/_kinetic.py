@@ -9,22 +9,13 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
+from .. import _tree as tree
+from .._checks import as_positive, scalar_fn
 from .._forms import as_form, divide, multiply
 from .._friction._base import MASS
 from .._friction._exponential import gauss_legendre
 from .._friction._linear import LinearFriction
-from .._misc import (
-    as_positive,
-    cast_to,
-    largest,
-    Scalar,
-    scalar_fn,
-    Time,
-    tree_dot,
-    tree_scale,
-    tree_sum,
-    tree_zeros,
-)
+from .._numbers import cast_to, Scalar, Time
 
 
 class AbstractKinetic(eqx.Module):
@@ -105,7 +96,7 @@ class QuadraticKinetic(AbstractKinetic):
     is_autonomous: ClassVar[bool] = True
 
     def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
-        energy = tree_dot(p, self.velocity(t, p, args))
+        energy = tree.dot(p, self.velocity(t, p, args))
         return energy / 2
 
     def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
@@ -120,7 +111,7 @@ class QuadraticKinetic(AbstractKinetic):
 
     def flow(self, friction, t, h, data, p, args):
         if friction is None:
-            return tree_scale(h, self.velocity(t, p, args)), None
+            return tree.scale(h, self.velocity(t, p, args)), None
         change, carried = friction.flow(data, p)
         return self.velocity(t, carried, args), change
 
@@ -155,7 +146,7 @@ class RelativisticKinetic(AbstractKinetic):
     def _scaled(self, p):
         """The momentum and `m c` in units of the largest of them, their squares, and
         the unit. Without units the squares would overflow."""
-        unit = largest(p)
+        unit = tree.largest(p)
         rest = cast_to(self.mass, unit) * cast_to(self.speed, unit)
         if rest.shape != ():
             raise ValueError(
@@ -166,8 +157,8 @@ class RelativisticKinetic(AbstractKinetic):
         # Neither results nor derivatives depend on the unit.
         rest = jnp.maximum(rest, jnp.finfo(rest.dtype).tiny)
         unit = lax.stop_gradient(jnp.maximum(unit, rest))
-        p = tree_scale(1 / unit, p)
-        return p, tree_dot(p, p), (rest / unit) ** 2, unit
+        p = tree.scale(1 / unit, p)
+        return p, tree.dot(p, p), (rest / unit) ** 2, unit
 
     is_quadratic: ClassVar[bool] = False
     is_autonomous: ClassVar[bool] = True
@@ -178,14 +169,14 @@ class RelativisticKinetic(AbstractKinetic):
 
     def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
         p, square, rest, unit = self._scaled(p)
-        return tree_scale(cast_to(self.speed, unit) / jnp.sqrt(square + rest), p)
+        return tree.scale(cast_to(self.speed, unit) / jnp.sqrt(square + rest), p)
 
     def prepare(self, friction, t, h, order):
         return prepare_quadrature(friction, t, h, order)
 
     def flow(self, friction, t, h, data, p, args):
         if friction is None:
-            return tree_scale(h, self.velocity(t, p, args)), None
+            return tree.scale(h, self.velocity(t, p, args)), None
         return integrate(self.velocity, friction, t, h, data, p, args)
 
     def rescale(self, s: Scalar) -> "RelativisticKinetic":
@@ -214,8 +205,8 @@ class CallableKinetic(AbstractKinetic):
 
     def rescale(self, s: Scalar) -> "CallableKinetic":
         def rescaled(t, p, args):
-            energy = self.fn(t, tree_scale(jnp.exp(s), p), args)
-            return tree_scale(jnp.exp(-2 * s), energy)
+            energy = self.fn(t, tree.scale(jnp.exp(s), p), args)
+            return tree.scale(jnp.exp(-2 * s), energy)
 
         return CallableKinetic(rescaled)
 
@@ -246,11 +237,11 @@ def integrate(
 
     def add(total, row):
         s, weight, data = row
-        left = p if friction is None else tree_sum(p, friction.decay(data, p))
-        part = tree_scale(weight, velocity(t + s, left, args))
-        return tree_sum(total, part), None
+        left = p if friction is None else tree.sum(p, friction.decay(data, p))
+        part = tree.scale(weight, velocity(t + s, left, args))
+        return tree.sum(total, part), None
 
-    total, _ = lax.scan(add, tree_zeros(p), (nodes, weights, each), unroll=True)
+    total, _ = lax.scan(add, tree.zeros(p), (nodes, weights, each), unroll=True)
     return total, None if friction is None else friction.decay(whole, p)
 
 

@@ -7,17 +7,11 @@ import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 from jaxtyping import Array, Bool, Inexact, PyTree
 
+from .. import _tree as tree
+from .._checks import check_callable, describe, scalar_fn
 from .._friction._base import AbstractFriction, Mechanics
 from .._friction._damping import as_laws
-from .._misc import (
-    all_finite,
-    cast_to,
-    check_callable,
-    describe,
-    Scalar,
-    scalar_fn,
-    Time,
-)
+from .._numbers import cast_to, Scalar, Time
 from ._base import AbstractSystem
 from ._split import AbstractSplit
 
@@ -185,7 +179,7 @@ class LagrangianSystem(AbstractSystem):
         M = self.mass_matrix(t, q, args)
         rounding = 1e3 * float(jnp.finfo(M.dtype).eps) * jnp.max(jnp.abs(M), initial=0)
         symmetric = jnp.all(jnp.abs(M - M.T) <= rounding)
-        return symmetric & all_finite((q, _solve_positive(M, p)))
+        return symmetric & tree.all_finite((q, _solve_positive(M, p)))
 
 
 @jax.jit

@@ -5,10 +5,12 @@ from collections.abc import Callable
 import jax
 from jaxtyping import Array, Bool, PyTree
 
+from .. import _tree as tree
+from .._checks import check_callable, scalar_fn
 from .._friction._base import AbstractFriction, Mechanics
 from .._friction._damping import as_laws
 from .._friction._fit import has_one_rate
-from .._misc import all_finite, check_callable, Scalar, scalar_fn, Time
+from .._numbers import Scalar, Time
 from ._base import AbstractSystem, momentum_of, P, Q
 from ._kinetic import AbstractKinetic, as_kinetic, QuadraticKinetic
 from ._mechanical_splits import KineticSplit, LocalSplit, PotentialSplit, SharedSplit
@@ -137,7 +139,7 @@ class MechanicalSystem(AbstractSystem):
         self, t: Time, q: Q, p: P, args: PyTree = None
     ) -> Bool[Array, ""] | None:
         # The flow of drag backwards in time ends after a finite time.
-        return all_finite((q, p)) if self.parts.drags else None
+        return tree.all_finite((q, p)) if self.parts.drags else None
 
     # The moves.
 

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import PyTree
 
+from .. import _tree as tree
 from .._compositions import lengths
 from .._friction._base import Linear
 from .._friction._drag import Drag
 from .._friction._fit import fit_friction
 from .._friction._log_scale import Linear as LinearScale
-from .._misc import State, Time, tree_add, tree_scale, tree_sum, tree_zeros, values
+from .._numbers import State, Time
 from ._split import AbstractSplit
 
 
@@ -23,12 +24,12 @@ if TYPE_CHECKING:
 
 
 def _potential_force(system: "System", t: Time, y: State) -> PyTree:
-    return system.term.potential.force(t, values(y)[0], system.args)
+    return system.term.potential.force(t, tree.values(y)[0], system.args)
 
 
 def _flow(system: "System", t: Time, h: Time, data: PyTree, y: State) -> State:
     """The flow of the kinetic energy and of linear friction."""
-    p = values(y)[1]
+    p = tree.values(y)[1]
     flow = system.term.kinetic.flow(system.friction, t, h, data, p, system.args)
     return system.add(y, flow)
 
@@ -67,14 +68,14 @@ class LocalSplit(AbstractSplit):
 
     def force(self, system, t, y) -> PyTree:
         """The force, and the numbers of the friction at the place."""
-        parts, at = system.term.parts, (t, values(y)[0], system.args)
+        parts, at = system.term.parts, (t, tree.values(y)[0], system.args)
         forms = [jtu.tree_map(jnp.asarray, part.form(*at)) for part in parts.local]
         drags = [drag.at(*at) for drag in parts.drags]
         numbers = [(drag.coefficient, drag.medium) for drag in drags]
         return _potential_force(system, t, y), forms, numbers
 
     def kick(self, system, t, h, y, force, order) -> State:
-        (force, forms, numbers), p = force, values(y)[1]
+        (force, forms, numbers), p = force, tree.values(y)[1]
         parts, mechanics = system.term.parts, system.term.mechanics
         pairs = zip(parts.local, forms, strict=True)
         linear = [Linear(LinearScale(), x, part.per_velocity) for part, x in pairs]
@@ -85,14 +86,14 @@ class LocalSplit(AbstractSplit):
 
         def pushed(dp: PyTree, h: Time) -> PyTree:
             if friction is None:
-                return tree_add(dp, h, force)
+                return tree.add(dp, h, force)
             data = friction.prepare(t, h, order)
-            gained = friction.decay(data, tree_sum(p, dp))
-            return tree_sum(dp, tree_sum(gained, friction.respond(data, force)))
+            gained = friction.decay(data, tree.sum(p, dp))
+            return tree.sum(dp, tree.sum(gained, friction.respond(data, force)))
 
         def slowed(drags: list[Drag], dp: PyTree, h: Time) -> PyTree:
             for drag in drags:
-                dp = tree_sum(dp, drag.decay(h, tree_sum(p, dp), mechanics.mass))
+                dp = tree.sum(dp, drag.decay(h, tree.sum(p, dp), mechanics.mass))
             return dp
 
         def stage(dp: PyTree, h: Time) -> tuple[PyTree, None]:
@@ -100,9 +101,9 @@ class LocalSplit(AbstractSplit):
             return slowed(drags[::-1], dp, h / 2), None
 
         if drags:
-            dp = lax.scan(stage, tree_zeros(p), lengths(order, h))[0]
+            dp = lax.scan(stage, tree.zeros(p), lengths(order, h))[0]
         else:
-            dp = pushed(tree_zeros(p), h)
+            dp = pushed(tree.zeros(p), h)
         return system.add(y, (None, dp))
 
 
@@ -124,7 +125,7 @@ class PotentialSplit(AbstractSplit):
     def drift(self, system, t, h, data, y) -> State:
         force = _potential_force(system, t, y)
         if system.friction is None:
-            return system.add(y, (None, tree_scale(h, force)))
+            return system.add(y, (None, tree.scale(h, force)))
         gained = system.friction.respond(data, force)
         return system.add(system.decay(data, y), (None, gained))
 
@@ -132,7 +133,7 @@ class PotentialSplit(AbstractSplit):
         return system.velocity(t, y)
 
     def kick(self, system, t, h, y, force, order) -> State:
-        return system.add(y, (tree_scale(h, force), None))
+        return system.add(y, (tree.scale(h, force), None))
 
 
 class SharedSplit(AbstractSplit):
@@ -147,13 +148,13 @@ class SharedSplit(AbstractSplit):
     kinds: frozenset[str] = eqx.field(static=True, default=frozenset({"shared"}))
 
     def times_mass(self, system: "System", x: PyTree) -> PyTree:
-        return system.term.kinetic.momentum(values(x))
+        return system.term.kinetic.momentum(tree.values(x))
 
     def _shift(self, system: "System", t: Time, y: State, sign: float) -> State:
         law = system.one_rate
         if law is None:
             return y
-        shift = tree_scale(sign * law.rate(t), self.times_mass(system, y[0]))
+        shift = tree.scale(sign * law.rate(t), self.times_mass(system, y[0]))
         return system.add(y, (None, shift))
 
     def enter(self, system: "System", t: Time, y: State) -> State:
@@ -167,9 +168,9 @@ class SharedSplit(AbstractSplit):
         return None if law is None else jnp.expm1(-law.increment(t, h) / 2)
 
     def drift(self, system, t, h, data, y) -> State:
-        y = system.add(y, (tree_scale(h, system.velocity(t, y)), None))
+        y = system.add(y, (tree.scale(h, system.velocity(t, y)), None))
         # From the frame of the start of the span to that of its end.
-        return y if data is None else system.add(y, tree_scale(data, values(y)))
+        return y if data is None else system.add(y, tree.scale(data, tree.values(y)))
 
     def force(self, system, t, y) -> PyTree:
         force, law = _potential_force(system, t, y), system.one_rate
@@ -177,4 +178,4 @@ class SharedSplit(AbstractSplit):
             return force
         rate, change = jax.jvp(law.rate, (t,), (jnp.ones_like(t),))
         mass = self.times_mass(system, y[0])
-        return tree_add(force, rate * rate / 4 + change / 2, mass)
+        return tree.add(force, rate * rate / 4 + change / 2, mass)

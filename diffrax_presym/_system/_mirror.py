@@ -7,16 +7,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, PyTree
 
-from .._misc import (
-    all_finite,
-    check_callable,
-    match,
-    Scalar,
-    scalar_fn,
-    tree_dot,
-    tree_sub,
-    tree_sum,
-)
+from .. import _tree as tree
+from .._checks import check_callable, match, scalar_fn
+from .._numbers import Scalar
 from ._kinetic import QuadraticKinetic
 
 
@@ -45,7 +38,7 @@ class AbstractMirrorMap(eqx.Module):
 
     def contains(self, q: PyTree) -> Bool[Array, ""]:
         """Whether `q` is inside the domain. False if `q` is not finite."""
-        return all_finite(q)
+        return tree.all_finite(q)
 
     # Relative to `inverse(gradient(q))`, which may differ from `q` by rounding, so that
     # the step of a zero momentum is exactly zero.
@@ -54,12 +47,12 @@ class AbstractMirrorMap(eqx.Module):
         r"""The mirror step $\nabla h^*(\nabla h(q) + p) - q$; not finite where
         undefined."""
         image = self.gradient(q)
-        end, start = self.inverse(tree_sum(image, p)), self.inverse(image)
-        return tree_sub(end, start)
+        end, start = self.inverse(tree.sum(image, p)), self.inverse(image)
+        return tree.sub(end, start)
 
     def change(self, q: PyTree, dq: PyTree) -> PyTree:
         r"""The difference $\nabla h(q + dq) - \nabla h(q)$."""
-        return tree_sub(self.gradient(tree_sum(q, dq)), self.gradient(q))
+        return tree.sub(self.gradient(tree.sum(q, dq)), self.gradient(q))
 
     def project(self, p: PyTree) -> PyTree:
         """`p` without the component that has no effect, if there is one."""
@@ -90,7 +83,7 @@ class EuclideanMirror(AbstractMirrorMap):
         self.kinetic = QuadraticKinetic(mass)
 
     def __call__(self, q: PyTree) -> Scalar:
-        return tree_dot(q, self.gradient(q)) / 2
+        return tree.dot(q, self.gradient(q)) / 2
 
     def gradient(self, q: PyTree) -> PyTree:
         return self.kinetic.momentum(q)
@@ -130,7 +123,7 @@ class EntropyMirror(AbstractMirrorMap):
         # On the simplex the linear part is constant, and omitted.
         linear = 0 if self.simplex else 1
         image = jtu.tree_map(lambda qi: jnp.log(qi) - linear, q)
-        return tree_dot(q, image)
+        return tree.dot(q, image)
 
     def gradient(self, q: PyTree) -> PyTree:
         return jtu.tree_map(jnp.log, q)
@@ -199,8 +192,8 @@ class MirrorMap(AbstractMirrorMap):
         return match(self.inverse_fn(w), w, "`inverse`", "`w`")
 
     def contains(self, q: PyTree) -> Bool[Array, ""]:
-        inside = all_finite(self(q)) if self.domain is None else self.domain(q)
-        return all_finite(q) & jnp.all(inside)
+        inside = tree.all_finite(self(q)) if self.domain is None else self.domain(q)
+        return tree.all_finite(q) & jnp.all(inside)
 
 
 def _everywhere(condition: Callable, q: PyTree) -> Bool[Array, ""]:

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from .._misc import as_parameter, as_positive, cast_to, check_callable, Scalar, Time
+from .._checks import as_parameter, as_positive, check_callable
+from .._numbers import cast_to, Scalar, Time
 
 
 class _PairwisePotential(eqx.Module):

@@ -5,11 +5,13 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
+from .. import _tree as tree
+from .._checks import scalar_fn
 from .._friction._base import Mechanics, Parts
 from .._friction._damping import as_laws, ConstantDamping, Damping
 from .._friction._fit import fit_friction, one_rate
 from .._friction._linear import LinearFriction
-from .._misc import Scalar, scalar_fn, Time, tree_scale
+from .._numbers import Scalar, Time
 from ._energy import Hamiltonian
 from ._kinetic import (
     AbstractKinetic,
@@ -129,11 +131,11 @@ class _ScaledKinetic(AbstractKinetic):
 
     def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
         scale, kinetic = self._parts(t)
-        return tree_scale(scale, scalar_fn(kinetic, "The kinetic energy")(t, p, args))
+        return tree.scale(scale, scalar_fn(kinetic, "The kinetic energy")(t, p, args))
 
     def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
         scale, kinetic = self._parts(t)
-        return tree_scale(scale, kinetic.velocity(t, p, args))
+        return tree.scale(scale, kinetic.velocity(t, p, args))
 
     def _by_eta1(self, p: PyTree) -> LinearFriction:
         mechanics = Mechanics(has_mass=False)
@@ -154,7 +156,7 @@ class _ScaledKinetic(AbstractKinetic):
             return integrate(self.velocity, friction, t, h, data, p, args)
         scale, displacement, decay = data
         carried = scale * displacement.leaves.carried
-        dq = self.kinetic.velocity(t, tree_scale(carried, p), args)
+        dq = self.kinetic.velocity(t, tree.scale(carried, p), args)
         return dq, friction.decay(decay, p)
 
     def rescale(self, s: Scalar) -> "AbstractKinetic":

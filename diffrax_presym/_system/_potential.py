@@ -6,9 +6,11 @@ import jax
 import lineax as lx
 from jaxtyping import Array, Inexact, PyTree
 
+from .. import _tree as tree
+from .._checks import check_callable, match, scalar_fn
 from .._forms import as_form, multiply
 from .._friction._base import AbstractFriction
-from .._misc import check_callable, match, Scalar, scalar_fn, Time, tree_dot, tree_scale
+from .._numbers import Scalar, Time
 from ._kinetic import AbstractKinetic
 
 
@@ -58,10 +60,10 @@ class QuadraticPotential(AbstractPotential):
         self.stiffness = as_form(stiffness, _STIFFNESS, positive=False)
 
     def __call__(self, t: Time, q: PyTree, args: PyTree = None) -> Scalar:
-        return -tree_dot(q, self.force(t, q)) / 2
+        return -tree.dot(q, self.force(t, q)) / 2
 
     def force(self, t: Time, q: PyTree, args: PyTree = None) -> PyTree:
-        return tree_scale(-1, multiply(self.stiffness, q, _STIFFNESS, "q"))
+        return tree.scale(-1, multiply(self.stiffness, q, _STIFFNESS, "q"))
 
 
 class ForceField(AbstractPotential):
@@ -108,7 +110,7 @@ class CallablePotential(AbstractPotential):
         return scalar_fn(self.fn, "The potential")(t, q, args)
 
     def force(self, t: Time, q: PyTree, args: PyTree = None) -> PyTree:
-        return tree_scale(-1, jax.grad(self.__call__, argnums=1)(t, q, args))
+        return tree.scale(-1, jax.grad(self.__call__, argnums=1)(t, q, args))
 
 
 def as_potential(potential) -> AbstractPotential:

@@ -8,13 +8,14 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool
 
+from .._checks import as_parameter, as_positive
 from .._friction._damping import (
     as_friction,
     ConstantDamping,
     Damping,
     LogDamping,
 )
-from .._misc import as_parameter, as_positive, as_time, cast_to, Scalar, Time
+from .._numbers import as_time, cast_to, Scalar, Time
 
 
 class AbstractScaling(eqx.Module):

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING
 import equinox as eqx
 from jaxtyping import PyTree
 
-from .._misc import State, Time, tree_scale
+from .. import _tree as tree
+from .._numbers import State, Time
 
 
 if TYPE_CHECKING:
@@ -60,4 +61,4 @@ class AbstractSplit(eqx.Module):
     ) -> State:
         """The flow of the other part at fixed time, over a length `h`. By default that
         of a force that does not depend on the momentum."""
-        return system.add(y, (None, tree_scale(h, force)))
+        return system.add(y, (None, tree.scale(h, force)))

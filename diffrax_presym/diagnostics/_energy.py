@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Inexact, PyTree
 
-from .._misc import as_time, cast_to, State, tree_dot, tree_sum
+from .. import _tree as tree
+from .._numbers import as_time, cast_to, State
 from .._system._base import AbstractSystem
 
 
@@ -58,7 +59,7 @@ def energy_error(
         energy = lambda t, q, p: system.energy(t, q, p, args)
         explicit, slope, _ = jax.grad(energy, argnums=(0, 1, 2))(t, *y)
         velocity, force = system.vf(t, y, args)
-        done = tree_dot(velocity, tree_sum(force, slope))
+        done = tree.dot(velocity, tree.sum(force, slope))
         return cast_to(explicit, done) + done
 
     done = _integral(power, system, ts, ys, args)
@@ -97,7 +98,7 @@ def energy_lost(
 
 def _power_lost(system: AbstractSystem, t, y: State, args: PyTree):
     velocity = system.velocity(t, *y, args)
-    return -tree_dot(velocity, system.friction_force(t, *y, args))
+    return -tree.dot(velocity, system.friction_force(t, *y, args))
 
 
 def _integral(

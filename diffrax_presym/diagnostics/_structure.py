@@ -9,7 +9,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Inexact, PyTree
 
 from .._friction._fit import has_one_rate
-from .._misc import as_time, State
+from .._numbers import as_time, State
 from .._system._base import AbstractSystem
 
 

@@ -1,0 +1,109 @@
+"""Arithmetic of states, each leaf in its own precision."""
+
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, ArrayLike, Bool, PyTree
+
+from ._numbers import cast_to
+
+
+class Sum(eqx.Module):
+    """A number with compensated summation, equal to `value + lost`.
+
+    `lost` is the rounding error of the additions so far.
+    """
+
+    value: Array
+    lost: Array
+
+    def __add__(self, x: Array) -> "Sum":
+        # Exact, whichever of the two is larger (Møller, Knuth).
+        x = x + self.lost
+        value = self.value + x
+        taken = value - self.value
+        return Sum(value, (self.value - (value - taken)) + (x - taken))
+
+    def __sub__(self, other: "Sum") -> Array:
+        return (self.value - other.value) + (self.lost - other.lost)
+
+
+_T = TypeVar("_T")
+is_sum = lambda x: isinstance(x, Sum)
+
+
+def values(x: _T) -> _T:
+    """The arrays of a state, without the errors kept by compensated summation."""
+    return jtu.tree_map(lambda x: x.value if is_sum(x) else x, x, is_leaf=is_sum)
+
+
+def rounding_errors(x: PyTree) -> PyTree:
+    """The rounding errors of a state whose leaves are `Sum`s."""
+    return jtu.tree_map(lambda x: x.lost, x, is_leaf=is_sum)
+
+
+def to_sums(y: PyTree, lost: PyTree) -> PyTree:
+    """A state with compensated summation; one that has it already stays as it is."""
+    leaf = lambda x, lost: x if is_sum(x) else Sum(x, lost)
+    return jtu.tree_map(leaf, y, lost, is_leaf=is_sum)
+
+
+def from_sums(sums: PyTree, like: PyTree) -> PyTree:
+    """The inverse of `to_sums`, for a state `like` the one that was given."""
+    leaf = lambda x, new: new if is_sum(x) else new.value
+    return jtu.tree_map(leaf, like, sums, is_leaf=is_sum)
+
+
+def add(y: PyTree, h: ArrayLike, dy: PyTree) -> PyTree:
+    """`y + h * dy`, each leaf in its own precision. Leaves of `y` may be `Sum`s."""
+    add = lambda di, yi: yi + cast_to(h, di) * di
+    return jtu.tree_map(add, dy, y)
+
+
+def sum(x: PyTree, y: PyTree) -> PyTree:
+    """`x + y`. Leaves of `x` may be `Sum`s."""
+    return jtu.tree_map(lambda yi, xi: xi + yi, y, x)
+
+
+def sub(x: PyTree, y: PyTree) -> PyTree:
+    """`x - y`, where both may have `Sum`s for leaves."""
+    return jtu.tree_map(lambda xi, yi: xi - yi, x, y, is_leaf=is_sum)
+
+
+def scale(c: ArrayLike | None, y: PyTree) -> PyTree:
+    """`c * y`, each leaf in its own precision; `y` if `c` is `None`."""
+    if c is None:
+        return y
+    return jtu.tree_map(lambda yi: cast_to(c, yi) * yi, y)
+
+
+def zeros(x: PyTree) -> PyTree:
+    """Arrays of zeros like the leaves, which may be `Sum`s."""
+    return jtu.tree_map(jnp.zeros_like, values(x))
+
+
+def where(condition: Bool[ArrayLike, ""], x: PyTree, y: PyTree) -> PyTree:
+    return jtu.tree_map(lambda xi, yi: jnp.where(condition, xi, yi), x, y)
+
+
+def dot(x: PyTree, y: PyTree) -> Array:
+    """The inner product of two pytrees of one structure."""
+    dots = jtu.tree_map(lambda xi, yi: jnp.sum(xi * yi), x, y)
+    with jax.numpy_dtype_promotion("standard"):
+        return jtu.tree_reduce(jnp.add, dots)
+
+
+def largest(x: PyTree) -> Array:
+    """The largest absolute value of all entries."""
+    sizes = jtu.tree_map(lambda x: jnp.max(jnp.abs(x), initial=0), x)
+    with jax.numpy_dtype_promotion("standard"):
+        return jtu.tree_reduce(jnp.maximum, sizes)
+
+
+def all_finite(x: PyTree) -> Bool[Array, ""]:
+    """Whether all entries of a pytree are finite."""
+    finite = jtu.tree_map(lambda xi: jnp.all(jnp.isfinite(xi)), x)
+    return jtu.tree_reduce(jnp.logical_and, finite, jnp.array(True))
