@@ -128,6 +128,12 @@ def prepare(moves: Moves, system: System, span: Span, backward: bool = False) ->
         return moves.prepare(system, span.reversed if backward else span)
 
     def column(move: Moves, rows: np.ndarray) -> PyTree:
+        which = np.arange(len(rows))
+        if system.prepares_once:  # what is prepared depends on the length alone
+            lengths = np.round(rows[:, 2], 15)
+            _, first, which = np.unique(lengths, return_index=True, return_inverse=True)
+            rows = rows[first]
+
         def one(*row) -> PyTree:
             part = span.part(*row)
             data = prepare(move, system, part, backward)
@@ -136,8 +142,12 @@ def prepare(moves: Moves, system: System, span: Span, backward: bool = False) ->
 
         if len(rows) == 1:
             row = one(*rows[0].tolist())
-            return jtu.tree_map(lambda x: jnp.expand_dims(x, 0), row)
-        return jax.vmap(one)(*(cast_to(x, span.h) for x in rows.T))
+            data = jtu.tree_map(lambda x: jnp.expand_dims(x, 0), row)
+        else:
+            data = jax.vmap(one)(*(cast_to(x, span.h) for x in rows.T))
+        return (
+            jtu.tree_map(lambda x: x[which], data) if len(rows) < len(which) else data
+        )
 
     columns = zip(moves.moves, np.moveaxis(moves.table, 1, 0), strict=True)
     return [column(*x) for x in columns]
