@@ -45,7 +45,6 @@ from ._step_size import (
 from ._system import (
     BregmanHamiltonian as BregmanHamiltonian,
     ConformalHamiltonian as ConformalHamiltonian,
-    CustomScaling as CustomScaling,
     DissipativeHamiltonian as DissipativeHamiltonian,
     EntropyMirror as EntropyMirror,
     EuclideanMirror as EuclideanMirror,
@@ -60,6 +59,7 @@ from ._system import (
     QuadraticKinetic as QuadraticKinetic,
     QuadraticPotential as QuadraticPotential,
     RelativisticKinetic as RelativisticKinetic,
+    Scaling as Scaling,
 )
 
 

@@ -20,5 +20,4 @@ from ._system._bound import System as System
 from ._system._kinetic import AbstractKinetic as AbstractKinetic
 from ._system._mirror import AbstractMirrorMap as AbstractMirrorMap
 from ._system._potential import AbstractPotential as AbstractPotential
-from ._system._scaling import AbstractScaling as AbstractScaling
 from ._system._split import AbstractSplit as AbstractSplit

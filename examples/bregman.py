@@ -101,7 +101,7 @@ def rates(quick):
     curves = {}
     for scaling, (law, t1) in SCALINGS.items():
         exponential_rate = scaling == "exponential"
-        row, c = f"{scaling:14}", float(law.c)
+        row, c = f"{scaling:14}", float(law.rate(1.0))
         for name, (objective, q0, exponent) in PROBLEMS.items():
             # The frequency on the quadratic grows, so more steps are needed.
             last = t1**0.75 if quick or name == "quadratic" else t1
@@ -159,7 +159,7 @@ def picture(path, curves, ns, errors):
                 continue
             ts, gap = curves[scaling, problem]
             (line,) = ax.loglog(ts, gap, label=scaling)
-            bound = gap[0] * 3 * (ts / ts[0]) ** -float(law.c)
+            bound = gap[0] * 3 * (ts / ts[0]) ** -float(law.rate(1.0))
             ax.loglog(ts, bound, ":", color=line.get_color(), lw=1)
         ax.set(
             title=f"{problem}: f − f* and the rate $t^{{-c}}$ (dotted)",

@@ -1159,6 +1159,6 @@ PRECISIONS = ["float64", "float32"]
 ELSEWHERE = {
     "StepDensityController",  # step_density
     *("ChosenStep", "FixedStepAdjoint", "StepsBetween"),  # choose_step, adjoint
-    *("ExponentialScaling", "CustomScaling", "MirrorMap"),  # bregman
+    "MirrorMap",  # bregman
     *("Splitting", "SplittingTableau"),  # tableaus
 }

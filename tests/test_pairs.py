@@ -21,6 +21,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import mutants
 import numpy as np
 import orders
 import pytest
@@ -439,3 +440,9 @@ def test_all_that_is_exported_is_in_the_catalogue():
 def test_the_table_of_orders():
     page = pathlib.Path(__file__).parents[1] / "docs" / "friction.md"
     assert orders.table() in page.read_text(), "Print it by `python tests/orders.py`."
+
+
+def test_deliberate_errors_apply():
+    package = pathlib.Path(dps.__file__).parent
+    for mutant in mutants.MUTANTS:
+        assert mutant.old in (package / mutant.file).read_text(), mutant.name

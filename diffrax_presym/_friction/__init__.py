@@ -7,5 +7,7 @@ from ._damping import (
 )
 from ._drag import Drag as Drag
 from ._log_scale import AbstractLogScale as AbstractLogScale
-from ._position import PositionDamping as PositionDamping
-from ._viscous import ViscousDamping as ViscousDamping
+from ._viscous import (
+    PositionDamping as PositionDamping,
+    ViscousDamping as ViscousDamping,
+)

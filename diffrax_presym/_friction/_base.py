@@ -1,7 +1,6 @@
 """What every law of friction declares: the parts it adds to the motion."""
 
 import abc
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -38,18 +37,11 @@ class Linear(NamedTuple):
     per_velocity: bool = False  # a coefficient, rather than a rate
 
 
-class Local(NamedTuple):
-    """Linear friction that depends on the place, part of every kick."""
-
-    form: Callable  # of t, q, args
-    per_velocity: bool = False
-
-
 class Parts(NamedTuple):
     """What a law of friction, or several, add to the motion of a system."""
 
     linear: tuple[Linear, ...] = ()
-    local: tuple[Local, ...] = ()
+    local: tuple[Any, ...] = ()  # of `LocalFriction`, part of every kick
     drags: tuple[Any, ...] = ()  # of `Drag`, part of every kick
     forces: tuple[Any, ...] = ()  # part of the force alone
 

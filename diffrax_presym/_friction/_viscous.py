@@ -1,8 +1,9 @@
-"""Friction by coefficients, the force per velocity."""
+"""Friction by coefficients, the force per velocity, and friction by place."""
 
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 from jaxtyping import PyTree
 
 from .. import _tree as tree
@@ -11,9 +12,9 @@ from .._numbers import Time
 from ._base import (
     AbstractFriction,
     COEFFICIENTS,
+    DAMPING,
     Form,
     Linear,
-    Local,
     Mechanics,
     Parts,
 )
@@ -36,7 +37,41 @@ def needs_mass(mechanics: Mechanics, name: str) -> None:
         )
 
 
-class ViscousDamping(AbstractFriction):
+class ViscousFriction(AbstractFriction):
+    """Linear friction by constant coefficients, part of every drift."""
+
+    coefficients: Form
+
+    def parts(self, mechanics: Mechanics) -> Parts:
+        if mechanics.mass_varies:
+            return Parts(forces=(self,))
+        needs_mass(mechanics, "ViscousDamping")
+        return Parts((Linear(LinearScale(), self.coefficients, per_velocity=True),))
+
+    def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
+        return tree.scale(-1, multiply(self.coefficients, v, COEFFICIENTS, "v"))
+
+
+class LocalFriction(AbstractFriction):
+    """Linear friction by a function of time and place, part of every kick."""
+
+    form: Callable  # of t, q, args
+    per_velocity: bool = eqx.field(static=True)  # a coefficient, rather than a rate
+
+    def parts(self, mechanics: Mechanics) -> Parts:
+        if self.per_velocity and mechanics.mass_varies:
+            return Parts(forces=(self,))
+        if self.per_velocity:
+            needs_mass(mechanics, "ViscousDamping")
+        return Parts(local=(self,))
+
+    def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
+        x, name = (v, COEFFICIENTS) if self.per_velocity else (p, DAMPING)
+        form: Any = self.form(t, q, args)
+        return tree.scale(-1, multiply(form, x, name, "p"))
+
+
+def ViscousDamping(coefficients) -> ViscousFriction | LocalFriction:
     r"""Friction $-C v$ by a coefficient $C$, in units of force per velocity: dashpots,
     viscous drag, magnetic fields, Coriolis forces.
 
@@ -62,56 +97,70 @@ class ViscousDamping(AbstractFriction):
 
     If $C$ depends on time or place, by a function, the friction is part of the kicks,
     and exact there at fixed positions: as [`diffrax_presym.PositionDamping`][].
+
+    **Arguments:**
+
+    - `coefficients`: $C$, in units of force per velocity (torque per angular
+        velocity for an angle), of any sign, in any of these forms.
+        - A number: the same for every degree of freedom.
+        - An array with as many dimensions as `p`, and broadcastable to it: a
+            coefficient for each degree of freedom.
+        - A square matrix, with `p` a vector; not necessarily symmetric.
+        - An array with one dimension more than `p`: a matrix for each vector over
+            the last axis of `p`. For the same matrix of `n` particles in three
+            dimensions, with `p` of shape `(n, 3)`, pass shape `(1, 3, 3)`.
+        - A pytree of the structure of `p`, whose leaves are any of the above.
+        - A `lineax.AbstractLinearOperator`, with `p` a vector. It is used as its
+            matrix.
+        - A function `C(t, q, args)` that returns any of the above but operators.
+
+    **Raises:**
+
+    `ValueError` if a coefficient is not a finite real number or array; and when the
+    solve is traced, if a shape does not fit `p` or the mass is not known.
     """
+    if coefficients is None:
+        raise ValueError(
+            f"{COEFFICIENTS} must be {_FORMS}, but got None. For one force per "
+            "velocity write `ViscousDamping(1.0)`."
+        )
+    if callable(coefficients) and not is_operator(coefficients):
+        return LocalFriction(coefficients, per_velocity=True)
+    return ViscousFriction(as_form(coefficients, COEFFICIENTS, positive=False))
 
-    coefficients: Form | Callable
 
-    def __init__(self, coefficients):
-        r"""**Arguments:**
+def PositionDamping(rate: Callable) -> LocalFriction:
+    r"""Friction $-\Gamma(t, q) \, p$ at a rate that depends on place: absorbing layers,
+    media, contact with a fluid.
 
-        - `coefficients`: $C$, in units of force per velocity (torque per angular
-            velocity for an angle), of any sign, in any of these forms.
-            - A number: the same for every degree of freedom.
-            - An array with as many dimensions as `p`, and broadcastable to it: a
-                coefficient for each degree of freedom.
-            - A square matrix, with `p` a vector; not necessarily symmetric.
-            - An array with one dimension more than `p`: a matrix for each vector over
-                the last axis of `p`. For the same matrix of `n` particles in three
-                dimensions, with `p` of shape `(n, 3)`, pass shape `(1, 3, 3)`.
-            - A pytree of the structure of `p`, whose leaves are any of the above.
-            - A `lineax.AbstractLinearOperator`, with `p` a vector. It is used as its
-                matrix.
-            - A function `C(t, q, args)` that returns any of the above but operators.
+    For [`diffrax_presym.MechanicalSystem`][]. The friction is part of the kicks, which
+    are exact at fixed positions: $p$ to $e^{-h \Gamma} p$ plus the momentum gained.
+    [`diffrax_presym.Strang`][], [`diffrax_presym.BlanesMoan4`][] and
+    [`diffrax_presym.BlanesMoan6`][] keep their order, and contract phase volume by the
+    friction at the kicks. Runge--Kutta--Nyström splittings such as
+    [`diffrax_presym.TunedRKN6`][] would not, and refuse it.
 
-        **Raises:**
+    The function is evaluated once per kick. A matrix is exponentiated in every kick.
+    For friction per velocity write [`diffrax_presym.ViscousDamping`][] with a function.
+    Where the rate does not depend on place [`diffrax_presym.ConstantDamping`][] is more
+    efficient.
 
-        `ValueError` if a coefficient is not a finite real number or array; and when the
-        solve is traced, if a shape does not fit `p` or the mass is not known.
-        """
-        if coefficients is None:
-            raise ValueError(
-                f"{COEFFICIENTS} must be {_FORMS}, but got None. For one force per "
-                "velocity write `ViscousDamping(1.0)`."
-            )
-        if not callable(coefficients) or is_operator(coefficients):
-            coefficients = as_form(coefficients, COEFFICIENTS, positive=False)
-        self.coefficients = coefficients
+    **Arguments:**
 
-    @property
-    def is_local(self) -> bool:
-        """Whether the coefficients depend on place."""
-        return callable(self.coefficients) and not is_operator(self.coefficients)
+    - `rate`: the rate $\Gamma$, in units of one over time, a function
+        `rate(t, q, args)` that returns a number; an array with as many dimensions
+        as `p` that broadcasts to it, a rate for each degree of freedom; a square
+        matrix, with `p` a vector; or a pytree of the structure of `p` of these.
 
-    def parts(self, mechanics: Mechanics) -> Parts:
-        coefficients: Any = self.coefficients
-        if mechanics.mass_varies:
-            return Parts(forces=(self,))
-        needs_mass(mechanics, "ViscousDamping")
-        if self.is_local:
-            return Parts(local=(Local(coefficients, per_velocity=True),))
-        return Parts((Linear(LinearScale(), coefficients, per_velocity=True),))
+    **Raises:**
 
-    def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
-        form: Any = self.coefficients
-        form = form(t, q, args) if self.is_local else form
-        return tree.scale(-1, multiply(form, v, COEFFICIENTS, "v"))
+    `ValueError` if it is not a function, and when the solve is traced if it returns
+    values of the wrong shape.
+    """
+    if not callable(rate):
+        raise ValueError(
+            "`PositionDamping(rate)` must be a function `rate(t, q, args)`, but "
+            f"got {rate!r}. For a rate that does not depend on place write "
+            "`ConstantDamping(rate)`."
+        )
+    return LocalFriction(rate, per_velocity=False)

@@ -12,32 +12,23 @@ from jaxtyping import Array, Inexact, PyTree
 
 from .. import _tree as tree
 from .._checks import check_root_finder
-from .._friction._linear import Effects
 from .._numbers import cast_to, State
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, Scheme
-from ._collocation import gauss_table, GaussTable, legendre, MAX_STAGES
+from ._collocation import gauss_table, legendre, MAX_STAGES
 from ._engine import AbstractMove, Outcome, Span, Stage
 from ._gauss_solve import (
     by_root_finder,
     contract,
     factorise,
     fixed_point,
+    Frames,
+    GaussStep,
     implicit,
+    matrix_product,
     Slopes,
-    Stages,
 )
 from ._moves import root_find
-
-
-class Frames(NamedTuple):
-    """The decays of momenta between the frames of a step; `None` without friction."""
-
-    to_middle: Effects  # from the start
-    from_middle: Effects  # to the end
-    whole: Effects
-    inwards: Effects  # from each stage to the middle
-    outwards: Effects  # from the middle to each stage
 
 
 class _Carry(NamedTuple):
@@ -46,48 +37,6 @@ class _Carry(NamedTuple):
     lost: State  # the rounding error of the state so far
     slopes: Slopes  # of the last step, for the initial guess
     h: Inexact[Array, ""]  # the length of the last step, zero if there was none
-
-
-class GaussStep(eqx.Module):
-    """The equations of the stages of one step."""
-
-    system: System
-    stages_number: int = eqx.field(static=True)
-    frames: Frames | None
-    t0: Array
-    h: Array
-    base: State  # the state at the start, in the frame of the middle
-    base_lost: State
-
-    @property
-    def table(self) -> GaussTable:
-        return gauss_table(self.stages_number)
-
-    @property
-    def times(self) -> Array:
-        return self.t0 + cast_to(self.table.nodes, self.h) * self.h
-
-    def stages(self, slopes: Slopes) -> Stages:
-        # Add the small terms first.
-        gained = jtu.tree_map(lambda x: _dot(self.table.mu, x), slopes)
-        add = lambda y, lost, x: y[None] + (lost[None] + x)
-        return jtu.tree_map(add, self.base, self.base_lost, gained)
-
-    def slopes(self, stages: Stages) -> Slopes:
-        system, frames = self.system, self.frames
-        both = (None, None) if frames is None else (frames.outwards, frames.inwards)
-
-        def one(t, weight, both, q, p):
-            outwards, inwards = both
-            p = system.move_frame(outwards, p)
-            velocity, force = system.velocity_and_force(t, (q, p))
-            return tree.scale(weight, (velocity, system.move_frame(inwards, force)))
-
-        weights = cast_to(self.table.weights, self.h) * self.h
-        return jax.vmap(one)(self.times, weights, both, *stages)
-
-    def residual(self, slopes: Slopes) -> Slopes:
-        return tree.sub(self.slopes(self.stages(slopes)), slopes)
 
 
 class Collocation(AbstractMove):
@@ -151,13 +100,13 @@ class Collocation(AbstractMove):
         ahead = jnp.stack(legendre(max(2, len(nodes)), 1 + 2 * ratio * nodes))
         weights = ratio * cast_to(table.weights, ratio)
         project = cast_to(table.project, ratio)
-        matrix = weights[:, None] * _dot(ahead[: len(nodes)].T, project)
+        matrix = weights[:, None] * matrix_product(ahead[: len(nodes)].T, project)
         if data is not None:
             # Backwards in time the slopes are those of this step.
             # About the decay from the middle of the last step.
             moved = jax.vmap(lambda p: system.move_frame(data.whole, p))(p)
             p = tree.where(ratio > 0, moved, p)
-        guess = jtu.tree_map(lambda x: _dot(matrix, x), (q, p))
+        guess = jtu.tree_map(lambda x: matrix_product(matrix, x), (q, p))
         return tree.where(known, guess, tree.zeros(guess))
 
     def _solve(self, step: GaussStep, guess: Slopes):
@@ -179,14 +128,6 @@ def _change(
         return q, p
     p = system.move_frame(data.from_middle, p)
     return q, jtu.tree_map(jnp.add, p, system.friction.decay(data.whole, p0))
-
-
-def _dot(matrix, x):
-    # A sum, which XLA fuses with what is around it, unlike its products of matrices.
-    matrix = cast_to(matrix, x)
-    return jnp.sum(
-        matrix.reshape(*matrix.shape, *(1,) * (x.ndim - 1)) * x[None], axis=1
-    )
 
 
 class PresymplecticGauss(AbstractPresymplecticSolver):

@@ -1,8 +1,9 @@
 """The solution of the equations of the stages of Gauss collocation."""
 
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
@@ -12,6 +13,10 @@ import numpy as np
 from jaxtyping import Array, Inexact, PyTree, Shaped
 
 from .. import _tree as tree
+from .._friction._linear import Effects
+from .._numbers import cast_to, State
+from .._system._bound import System
+from ._collocation import gauss_table, GaussTable
 from ._moves import RootFind
 
 
@@ -22,20 +27,67 @@ Slopes = PyTree[Shaped[Array, "stages ..."]]
 Stages = PyTree[Shaped[Array, "stages ..."]]
 
 
-@runtime_checkable
-class Equations(Protocol):
-    """The equations of the stages of a step."""
+class Frames(NamedTuple):
+    """The decays of momenta between the frames of a step; `None` without friction."""
 
+    to_middle: Effects  # from the start
+    from_middle: Effects  # to the end
+    whole: Effects
+    inwards: Effects  # from each stage to the middle
+    outwards: Effects  # from the middle to each stage
+
+
+class GaussStep(eqx.Module):
+    """The equations of the stages of one step."""
+
+    system: System
+    stages_number: int = eqx.field(static=True)
+    frames: Frames | None
+    t0: Array
     h: Array
+    base: State  # the state at the start, in the frame of the middle
+    base_lost: State
 
-    def stages(self, slopes: Slopes) -> Stages: ...
+    @property
+    def table(self) -> GaussTable:
+        return gauss_table(self.stages_number)
 
-    def slopes(self, stages: Stages) -> Slopes: ...
+    @property
+    def times(self) -> Array:
+        return self.t0 + cast_to(self.table.nodes, self.h) * self.h
 
-    def residual(self, slopes: Slopes) -> Slopes: ...
+    def stages(self, slopes: Slopes) -> Stages:
+        # Add the small terms first.
+        gained = jtu.tree_map(lambda x: matrix_product(self.table.mu, x), slopes)
+        add = lambda y, lost, x: y[None] + (lost[None] + x)
+        return jtu.tree_map(add, self.base, self.base_lost, gained)
+
+    def slopes(self, stages: Stages) -> Slopes:
+        system, frames = self.system, self.frames
+        both = (None, None) if frames is None else (frames.outwards, frames.inwards)
+
+        def one(t, weight, both, q, p):
+            outwards, inwards = both
+            p = system.move_frame(outwards, p)
+            velocity, force = system.velocity_and_force(t, (q, p))
+            return tree.scale(weight, (velocity, system.move_frame(inwards, force)))
+
+        weights = cast_to(self.table.weights, self.h) * self.h
+        return jax.vmap(one)(self.times, weights, both, *stages)
+
+    def residual(self, slopes: Slopes) -> Slopes:
+        return tree.sub(self.slopes(self.stages(slopes)), slopes)
 
 
-def implicit(step: Equations, find, guess: Slopes, tangent):
+def matrix_product(matrix, x):
+    # A sum, which XLA fuses with what is around it, unlike its products of matrices.
+    matrix = cast_to(matrix, x)
+    return jnp.sum(
+        matrix.reshape(*matrix.shape, *(1,) * (x.ndim - 1)) * x[None], axis=1
+    )
+
+
+def implicit(step: GaussStep, find, guess: Slopes, tangent):
     """The slopes that are found, with the derivatives of the implicit function.
 
     `find` returns them and a result.
@@ -82,7 +134,7 @@ _NEGLIGIBLE = 1e-3
 _ROUNDING = 16.0
 
 
-def fixed_point(step: Equations, guess: Slopes, max_iterations: int, tolerance: float):
+def fixed_point(step: GaussStep, guess: Slopes, max_iterations: int, tolerance: float):
     """Fixed-point iteration, to rounding unless a tolerance is given.
 
     It stops when its changes no longer decrease. The remaining error is rounding, of
@@ -144,7 +196,7 @@ def fixed_point(step: Equations, guess: Slopes, max_iterations: int, tolerance: 
     return search.slopes, results.where(converged, results.successful, failure)
 
 
-def by_root_finder(step: Equations, guess: Slopes, find: RootFind):
+def by_root_finder(step: GaussStep, guess: Slopes, find: RootFind):
     # Extrapolation of stiff components may be inaccurate.
     sizes = (tree.largest(step.residual(x)) for x in (guess, tree.zeros(guess)))
     better = jnp.less(*sizes)

@@ -21,7 +21,7 @@ from ._potential import (
     QuadraticPotential as QuadraticPotential,
 )
 from ._scaling import (
-    CustomScaling as CustomScaling,
     ExponentialScaling as ExponentialScaling,
     PolynomialScaling as PolynomialScaling,
+    Scaling as Scaling,
 )

@@ -11,7 +11,7 @@ from .._friction._base import AbstractFriction
 from .._numbers import Scalar, State, Time
 from ._base import AbstractSystem, P, Q
 from ._mirror import AbstractMirrorMap
-from ._scaling import AbstractScaling
+from ._scaling import Scaling
 from ._split import AbstractSplit
 
 
@@ -71,7 +71,7 @@ class BregmanHamiltonian(AbstractSystem):
 
     mirror_map: AbstractMirrorMap
     objective: Callable
-    scaling: AbstractScaling
+    scaling: Scaling
     gradient_fn: Callable | None
 
     def __init__(self, mirror_map, objective, scaling, *, gradient=None):
@@ -97,11 +97,10 @@ class BregmanHamiltonian(AbstractSystem):
                 f"{mirror_map!r}. For a custom function `h(q)` write "
                 "`MirrorMap(h, inverse)`."
             )
-        if not isinstance(scaling, AbstractScaling):
+        if not isinstance(scaling, Scaling):
             raise ValueError(
                 "`scaling` must be a scaling such as `PolynomialScaling(2.0)`, but got "
-                f"{scaling!r}. For custom functions write "
-                "`CustomScaling(alpha, beta, gamma, t0=t0, t1=t1)`."
+                f"{scaling!r}. For functions of your own write `Scaling(gamma, beta)`."
             )
         check_callable(objective, "objective", "f(t, q, args)")
         check_callable(gradient, "gradient", "gradient(t, q, args)", optional=True)
@@ -155,5 +154,4 @@ class BregmanHamiltonian(AbstractSystem):
         self, t: Time, q: Q, p: P, args: PyTree = None
     ) -> Bool[Array, ""] | None:
         valid = self.mirror_map.contains(q) & tree.all_finite(p)
-        conditions = self.scaling.is_valid(t)
-        return valid if conditions is None else valid & conditions
+        return valid & self.scaling.is_valid(t)
