@@ -2,7 +2,7 @@
 
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -157,25 +157,29 @@ def work_precision(
     reference = _agreed(finest, tolerance)
     exact = finest[reference].leaves
     window = lambda error: goal / 10 <= error <= 1 / goal
-    measured = []
+    measured, calls = [], []
+
+    def measure(name: str, solve: Solve, settings: Iterable[tuple[int, float]]) -> None:
+        for number, x in settings:
+            solution = Solution.of(number, solve, x)
+            error = _error(solution, exact, tolerance)
+            if window(error):
+                measured.append((name, error, solution.steps, x))
+                calls.append(lambda x=x: solve(x))
+            if error < goal:
+                break
+
     for name, solve in solves.items():
-        for n in _ladder(max_steps):
-            solution = run(solve, n)
-            error = _error(solution, exact, tolerance)
-            if window(error):
-                measured.append((name, error, solution.steps, span / n, solve))
-            if error < goal:
-                break
+        measure(name, solve, ((n, span / n) for n in _ladder(max_steps)))
+    levels = [tolerance[0] / goal * 10 ** (-k / 2) for k in range(4 * decades + 5)]
     for name, solve in (adaptive or {}).items():
-        for k in range(2 * (2 * decades + 2) + 1):
-            level = tolerance[0] / goal * 10 ** (-k / 2)
-            solution = Solution.of(0, solve, level)
-            error = _error(solution, exact, tolerance)
-            if window(error):
-                measured.append((name, error, solution.steps, level, solve))
-            if error < goal:
-                break
-    return WorkPrecision(_timed(measured, repeats), reference)
+        measure(name, solve, ((0, level) for level in levels))
+    rows = zip(measured, _medians(calls, repeats), strict=True)
+    runs = tuple(
+        WorkPrecisionRun(name, error, seconds, steps, x)
+        for (name, error, steps, x), seconds in rows
+    )
+    return WorkPrecision(runs, reference)
 
 
 def _ladder(max_steps: int):
@@ -218,22 +222,12 @@ def _agreed(finest: Mapping[str, Solution], tolerance) -> str:
     return max(finest, key=lambda name: (votes[name], finest[name].steps))
 
 
-def _timed(measured: list[tuple], repeats: int) -> tuple[WorkPrecisionRun, ...]:
-    calls = [(solve, setting) for *_, setting, solve in measured]
-    return tuple(
-        WorkPrecisionRun(name, error, seconds, steps, setting)
-        for (name, error, steps, setting, _), seconds in zip(
-            measured, _medians(calls, repeats), strict=True
-        )
-    )
-
-
-def _medians(calls: list[tuple[Solve, float]], repeats: int) -> list[float]:
+def _medians(calls: list[Callable], repeats: int) -> list[float]:
     """The median time of each call, all of them alternately."""
     seconds: list[list[float]] = [[] for _ in calls]
     for _ in range(repeats):
-        for (solve, setting), times in zip(calls, seconds, strict=True):
+        for call, times in zip(calls, seconds, strict=True):
             start = time.perf_counter()
-            jax.block_until_ready(solve(setting))
+            jax.block_until_ready(call())
             times.append(time.perf_counter() - start)
     return [statistics.median(times) for times in seconds]
