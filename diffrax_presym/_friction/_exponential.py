@@ -96,12 +96,13 @@ def exponentials(
     fractions = times / jnp.where(longest == 0, 1, longest)
 
     z = -unit * matrix
-    powers = [jnp.broadcast_to(jnp.eye(z.shape[-1], dtype=z.dtype), z.shape)]
-    for _ in range(_TERMS):
-        powers.append(_product(powers[-1], z))
+    one = jnp.broadcast_to(jnp.eye(z.shape[-1], dtype=z.dtype), z.shape)
+    # Loops rather than code for each term, which takes long to compile.
+    power = lambda x, _: (_product(x, z), x)
+    _, powers = lax.scan(power, one, None, length=_TERMS + 1)
     factorials = [float(math.factorial(k + 1)) for k in range(_TERMS)]
     terms = jnp.stack([fractions**k / f for k, f in enumerate(factorials)], axis=1)
-    combine = lambda c, x: jnp.tensordot(c, jnp.stack(x), 1, precision="highest")
+    combine = lambda c, x: jnp.tensordot(c, x, 1, precision="highest")
     mean = combine(terms, powers[:-1])
     change = combine(fractions[:, None] * terms, powers[1:])
 
@@ -157,12 +158,15 @@ def _parts(matrix: Array, time: Array) -> Array:
 
 
 def _short(matrix: Array, time: Array, x: Array) -> tuple[Array, Array]:
-    last, change, integral = x, jnp.zeros_like(x), jnp.zeros_like(x)
-    for k in range(1, _TERMS + 1):
+    def term(state, k):
+        last, change, integral = state
         integral = integral + last * (time / k)
         last = matvec(matrix, last) * (-time / k)
-        change = change + last
-    return change, integral
+        return (last, change + last, integral), None
+
+    zero = jnp.zeros_like(x)
+    numbers = np.arange(1, _TERMS + 1, dtype=x.dtype)
+    return lax.scan(term, (x, zero, zero), numbers)[0][1:]
 
 
 @exponential_products.defjvp
