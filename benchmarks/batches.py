@@ -43,10 +43,7 @@ class Method(NamedTuple):
     adaptive: bool = False
 
 
-NAMES = (
-    *("PresymplecticLeapfrog", "BlanesMoanRKN4", "BlanesMoanRKN6"),
-    "BlanesCasasRKN8",
-)
+NAMES = "PresymplecticLeapfrog BlanesMoanRKN4 BlanesMoanRKN6 BlanesCasasRKN8".split()
 OURS = [Method(name, SCHEMES[name]) for name in NAMES]
 RIVALS = [
     Method(f"{name}, {kind}", DIFFRAX[name], kind == "adaptive")

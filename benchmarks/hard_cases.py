@@ -39,21 +39,16 @@ quartic = lambda t, q, args: -jnp.sum(q**4)
 mixed = lambda t, q, p, args: (1 + jnp.sum(q**2)) * (1 + jnp.sum(p**2)) / 2
 duffing = lambda t, q, args: jnp.sum(q**4 / 4 - q**2 / 2 - 0.3 * q * jnp.cos(1.2 * t))
 henon_heiles = damped_henon_heiles().system.potential
-
-
-def newton(t, q, args):
-    return -1 / jnp.sqrt(jnp.sum(q**2) + (0.0 if args is None else args**2))
-
+softened = lambda q, args: jnp.sum(q**2) + (0.0 if args is None else args**2)
+newton = lambda t, q, args: -1 / jnp.sqrt(softened(q, args))
+# A step density, by Kepler's third law.
+distance = lambda t, y, args: jnp.linalg.norm(y[0]) ** 1.5
+height = lambda t, y, args, **kwargs: y[0][0]
 
 run = eqx.filter_jit(solve)
 ZERO = jnp.zeros(())
 adaptive = lambda tolerance: dfx.PIDController(rtol=tolerance, atol=tolerance)
 successful = lambda sol: sol.result == dfx.RESULTS.successful
-
-
-def distance(t, y, args):
-    """A step density, by Kepler's third law."""
-    return jnp.linalg.norm(y[0]) ** 1.5
 
 
 def end(*arguments, **options):
@@ -100,16 +95,10 @@ def canonical_form(potential, gamma):
 
 # Those that the groups of one scheme each compare.
 FEW = (
-    *("PresymplecticEuler", "PresymplecticLeapfrog", "PresymplecticYoshida4"),
-    *(
-        "Suzuki4",
-        "BlanesMoan4",
-        "BlanesMoanRKN4",
-        "SofroniouSpaletta(6)",
-        "BlanesMoan6",
-    ),
-    *("BlanesMoanRKN6", "SofroniouSpaletta(8)", "BlanesCasasRKN8"),
-)
+    "PresymplecticEuler PresymplecticLeapfrog PresymplecticYoshida4 Suzuki4 "
+    "BlanesMoan4 BlanesMoanRKN4 SofroniouSpaletta(6) BlanesMoan6 BlanesMoanRKN6 "
+    "SofroniouSpaletta(8) BlanesCasasRKN8"
+).split()
 
 
 def stability(quick):
@@ -339,10 +328,6 @@ def singular_damping(quick):
             sol, (q, _) = end(system, solver, t0, 1.0, (1.0 - t0) / 100, y0)
             cells.append(abs(q[0] - exact) if successful(sol) else "reported")
         table.row(name, *cells)
-
-
-def height(t, y, args, **kwargs):
-    return y[0][0]
 
 
 def non_smooth(quick):

@@ -26,6 +26,7 @@ METHODS = {
 # Steps to an orbit, without simple ratios to angles of roots.
 STEPS = np.round(1.0137 * np.geomspace(40, 170, 24), 1)
 SHOWN = (4, 12, 20)
+force = lambda q: -q / np.sum(q**2, axis=-1, keepdims=True) ** 1.5
 
 
 def stability_limit(table):
@@ -46,10 +47,6 @@ def position(t, e):
         anomaly = anomaly - step / (1 - e * np.cos(anomaly))
     x, y = np.cos(anomaly) - e, np.sqrt(1 - e**2) * np.sin(anomaly)
     return np.stack([x, y], axis=-1)
-
-
-def force(q):
-    return -q / np.sum(q**2, axis=-1, keepdims=True) ** 1.5
 
 
 def energy_errors(table, eccentricity, steps, orbits=60):

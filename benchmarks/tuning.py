@@ -41,9 +41,6 @@ SCHEMES = ("BlanesMoanRKN4", "BlanesMoanRKN6", "BlanesCasasRKN8")
 TUNED = ("TunedRKN6", "TunedLinear8")
 
 
-# A step of an oscillator.
-
-
 def oscillator(moves, kick_first, z):
     """The matrices of a step, less those of a rotation by `z`."""
     rows = [[jnp.full_like(z, i == j) for j in (0, 1)] for i in (0, 1)]
