@@ -143,7 +143,7 @@ def exact_solution(problem):
 
     n = len(problem.y0[0])
     K = n**2 * (2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
-    rates = np.asarray(problem.system.friction[0].gamma)
+    rates = np.asarray(problem.system.friction[0].rate(0.0))
     matrix = np.block([[np.zeros((n, n)), np.eye(n)], [-K, -np.diag(rates)]])
     y = scipy.linalg.expm(matrix * problem.t1) @ np.concatenate(problem.y0)
     return np.split(y, 2)

@@ -6,7 +6,7 @@ with respect to the initial state and the damping, over that of the same solve a
 `FixedStepAdjoint` is measured by reversal and by checkpoints, beside Diffrax's
 `RecursiveCheckpointAdjoint` and reverse mode through a `lax.scan` written by hand,
 whose number of steps is fixed when it is compiled. Runs that would take too long or too
-much memory are omitted, and those of minutes are made once.
+much memory are omitted, and the longest are made once.
 
 `--batches` measures one pendulum each under `vmap`, in batches of 1, 64, 1000 and 4096,
 with the gradient for each member, with the leapfrog and with `TunedRKN6`.
@@ -36,7 +36,8 @@ ADJOINTS = {
     "Diffrax's": dfx.RecursiveCheckpointAdjoint(),
 }
 # Steps times unknowns beyond which a method is not tried.
-MOST = {"reversal": 1e10, "checkpoints": 1e8, "Diffrax's": 2e7, "scan": 3e7}
+LONGEST = 1e9
+MOST = {"reversal": LONGEST, "checkpoints": 1e8, "Diffrax's": 2e7, "scan": 3e7}
 LONG = 3e8  # Beyond which a program runs once, without a warm-up.
 
 SYSTEMS = {
@@ -123,12 +124,12 @@ def times(system, sizes, counts, repeats):
         *("unknowns:>9", "steps:>7", "solve, ms:>10.3g"),
         *(f"{name}:>13.2f" for name in MOST),
     )
-    for n in sizes:
-        for steps in counts:
+    for n, steps in itertools.product(sizes, counts):
+        if n * steps <= LONGEST:
             programs = {
                 name: compiled(loss, problem(n))
                 for name, loss in methods(system, steps).items()
-                if n * steps <= MOST.get(name, MOST["reversal"])
+                if n * steps <= MOST.get(name, LONGEST)
             }
             once = n * steps > LONG
             found = interleaved(programs, 1 if once else repeats, warm_up=not once)

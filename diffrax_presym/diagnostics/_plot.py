@@ -61,7 +61,9 @@ def plot_phase(sol: dfx.Solution, axes: Any = None, most: int = 6):
     for i in range(min(q.shape[1], most)):
         axes.plot(q[:, i], p[:, i], label=f"{i + 1}")
     if q.shape[1] > 1:
-        axes.legend(title="degree of freedom")
+        # Beside the lines, which may be anywhere.
+        beside = {"loc": "center left", "bbox_to_anchor": (1, 0.5)}
+        axes.legend(title="degree\nof freedom", **beside)
     axes.set(xlabel="position $q$", ylabel="momentum $p$")
     return axes
 
