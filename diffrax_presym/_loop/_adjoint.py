@@ -40,7 +40,7 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     respect to `y0`, `args`, the system, and everything that a function of these or of
     `SaveAt(fn=...)` closes over; derivatives with respect to times are errors. By
     default the scheme is run backwards: memory does not depend on the number of steps,
-    and a gradient costs two to four solves. Damping loses information: backwards in
+    and a gradient costs two to five solves. Damping loses information: backwards in
     time rounding errors grow by $e^{\eta(t_1) - \eta(t_0)}$. So states are kept along
     the way, more with more damping, from which the backward pass restarts. The error of
     the recomputed states is measured at each kept state, and one beyond `tol` raises an
