@@ -44,7 +44,7 @@ residuals = lambda x, _=None: (model(x) - data) / noise
 guess = jnp.array([0.3, 2.2])
 fit = optx.least_squares(
     residuals,
-    optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8),
+    optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6),
     guess,
     options=dict(jac="bwd"),
 )
