@@ -109,8 +109,9 @@ class Linear(AbstractLogScale):
 
     def effect(self, rate: Array, t: Time, h: Time, order: int) -> Effect:
         x = cast_to(rate, h := as_time(h)) * h
-        ratio = expm1_ratio(-x)
-        return Effect(-x * ratio, h * ratio, h * ratio)
+        # `-x * ratio` would not be exactly -1 where friction stops the motion.
+        integral = h * expm1_ratio(-x)
+        return Effect(expm1(-x), integral, integral)
 
 
 # Of the singularity: the momentum left there is less than rounding.

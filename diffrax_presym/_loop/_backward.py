@@ -215,14 +215,24 @@ class Backward(eqx.Module):
     def _pull_row(self, i: int, at: Position, j: Array):
         """Pull back one row of an output, from the start of its step."""
         moved, fixed = self._parameters
+        bar, rows = (
+            self._row(i, int(self.problem.subs[i].t0) + j, True),
+            self.problem.rows[i],
+        )
 
-        def output(moved, start):
-            parameters = eqx.combine(moved, fixed)
-            saved, _ = self.problem.output(i, parameters, j, start)
-            return eqx.filter(saved, eqx.is_inexact_array)
+        def pull(shorter: bool):
+            def output(moved, start):
+                parameters = eqx.combine(moved, fixed)
+                saved, _ = self.problem.output(i, parameters, j, start, shorter)
+                return eqx.filter(saved, eqx.is_inexact_array)
 
-        bar = self._row(i, int(self.problem.subs[i].t0) + j, True)
-        return jax.vjp(output, moved, at.point)[1](bar)
+            return jax.vjp(output, moved, at.point)[1](bar)
+
+        if not rows.may_be_inside:
+            return pull(False)
+        # Decided before the derivative is taken: in a batch, JAX would differentiate
+        # the branch that is not taken at zeros, where an implicit step is singular.
+        return lax.cond(rows.inside[j], lambda: pull(True), lambda: pull(False))
 
     def _pull_rows(self, i: int):
         """Pull back all rows of an output."""

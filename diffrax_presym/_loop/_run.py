@@ -87,28 +87,47 @@ class Problem(eqx.Module):
         return prepare_once(self.scheme.moves, system, span, backward)
 
     def between(
-        self, system: System, n: Array, start: Point, t: Array, inside: Array
+        self,
+        system: System,
+        n: Array,
+        start: Point,
+        t: Array,
+        inside: Array,
+        shorter: bool | None = None,
     ) -> PyTree:
-        """The state at a time `inside` step `n`, or at its start."""
-        begin, end = self.steps.time(n), self.steps.time(n + 1)
-        # There is no step of zero length, which friction that is singular at its start
-        # would not allow.
-        t = jnp.where(inside, t, jnp.where(end > begin, end, begin + 1))
+        """The state at a time `inside` step `n`, or at its start; that of the `shorter`
+        step or of the start if it is known which."""
+        last, begin, end = (self.steps.time(n + i) for i in (-1, 0, 1))
+        # A batch computes the shorter step at the start of a step too, and after the
+        # last one. Its result is not used, but it must be one that succeeds: half of a
+        # step, as friction that is singular at its start would not allow none.
+        length = jnp.where(end > begin, end - begin, begin - last)
+        length = jnp.where(length > 0, length, 1)
+        t = jnp.where(inside, t, begin + length / 2)
         times = system.time(begin), system.time(t)
-        shorter = lambda: between(self.scheme, system, times[0], start, times[1])
+        step = lambda: between(self.scheme, system, times[0], start, times[1])
         y = system.values(start[0])
+        if shorter is not None:
+            return step() if shorter else y
         if self.at_once:
             # Under `jax.vmap` a `lax.cond` computes both, and copies what both share,
             # such as matrices of friction, for each row.
-            return tree.where(inside, shorter(), y)
-        return lax.cond(inside, shorter, lambda: y)
+            return tree.where(inside, step(), y)
+        return lax.cond(inside, step, lambda: y)
 
-    def output(self, i: int, parameters: Parameters, j: Array, start: Point) -> PyTree:
+    def output(
+        self,
+        i: int,
+        parameters: Parameters,
+        j: Array,
+        start: Point,
+        shorter: bool | None = None,
+    ) -> PyTree:
         """What output `i` saves in row `j`, from the state at the start of its step."""
         (system, fns), rows, y = parameters, self.rows[i], start[0]
         if rows.may_be_inside:
             at = rows.stop[j], start, rows.time[j], rows.inside[j]
-            y = self.between(system, *at)
+            y = self.between(system, *at, shorter)
         return fns[i](rows.time[j], y, system.args), tree.all_finite(y)
 
     def outputs(
