@@ -529,3 +529,22 @@ def test_whatever_holds_an_array(holder):
 def test_a_checkpointed_potential_is_stepped():
     value = _held(1.3, HOLDERS["checkpoint"], REVERSIBLE)
     np.testing.assert_allclose(value, _held_by_checkpoints()[0], rtol=1e-14)
+
+
+def test_the_last_saved_time_where_steps_are_short():
+    # In a batch the last row computes a step too, which must not be one second long.
+    system = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), lambda t, q, args: 1e18 * jnp.sum(q**4)
+    )
+    ts = jnp.linspace(0.0, 1e-8, 8)
+
+    def saved(q):
+        y0 = q[None], jnp.zeros(1)
+        options = {"saveat": dfx.SaveAt(ts=ts), "adjoint": dps.FixedStepAdjoint()}
+        solver = dps.BlanesMoanRKN4()
+        sol = dfx.diffeqsolve(system, solver, 0.0, 1e-8, 1e-10, y0, **options)
+        assert sol.ys is not None
+        return jnp.sum(sol.ys[0])
+
+    gradient = jax.vmap(jax.grad(saved))(jnp.array([0.5, 1.0]))
+    assert jnp.all(jnp.isfinite(gradient))
