@@ -30,11 +30,10 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
 
     For every solver of this package, with `diffrax.ConstantStepSize`,
     [`diffrax_presym.StepsBetween`][] or `diffrax.StepTo`, and any `SaveAt` but dense
-    output. With a
-    constant step the steps are all equal: as few as are not longer than `dt0`. (Diffrax
-    takes the first of the length `dt0`, if that does not divide the time of the solve;
-    and its times may differ in the last bit.) Events, dense output and adaptive
-    steps are errors; use `diffrax.RecursiveCheckpointAdjoint` for these.
+    output. With a constant step the steps are all equal: as few as are not longer than
+    `dt0`. (Diffrax takes the first of the length `dt0`, if that does not divide the
+    time of the solve; and its times may differ in the last bit.) Events, dense output
+    and adaptive steps are errors; use `diffrax.RecursiveCheckpointAdjoint` for these.
 
     The gradient is that of the discrete solution ("discretise, then optimise"), with
     respect to `y0`, `args`, the system, and everything that a function of these or of

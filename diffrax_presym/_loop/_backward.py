@@ -215,10 +215,8 @@ class Backward(eqx.Module):
     def _pull_row(self, i: int, at: Position, j: Array):
         """Pull back one row of an output, from the start of its step."""
         moved, fixed = self._parameters
-        bar, rows = (
-            self._row(i, int(self.problem.subs[i].t0) + j, True),
-            self.problem.rows[i],
-        )
+        bar = self._row(i, int(self.problem.subs[i].t0) + j, True)
+        rows = self.problem.rows[i]
 
         def pull(shorter: bool):
             def output(moved, start):

@@ -50,8 +50,8 @@ def structure_defect(
     return _structure_defect(system, solver, as_time(t0), as_time(t1), y, args)
 
 
-def _jacobian(system, solver, t0, t1, y, args):
-    """The state at the start of a step as a vector, and the Jacobian of the step."""
+@eqx.filter_jit
+def _structure_defect(system, solver, t0, t1, y, args):
     start, unravel = ravel_pytree(y)
 
     def end(x):
@@ -61,12 +61,7 @@ def _jacobian(system, solver, t0, t1, y, args):
         return ravel_pytree(y1)[0]
 
     # Diffrax's own solvers support reverse mode.
-    return start, jax.jacrev(end)(start)
-
-
-@eqx.filter_jit
-def _structure_defect(system, solver, t0, t1, y, args):
-    start, jacobian = _jacobian(system, solver, t0, t1, y, args)
+    jacobian = jax.jacrev(end)(start)
     n = start.size // 2
     form = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
     damping = system.damping
