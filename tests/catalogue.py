@@ -855,7 +855,7 @@ def offered(system: System, friction: Friction) -> frozenset[str] | Refused:
         return Refused("not of joints") if friction.needs == "bodies" else frozenset()
     if friction.needs and system.mass is None:
         return Refused("no mass")
-    if friction.name == "operator" and not isinstance(system.q, np.ndarray):
+    if friction.name == "operator" and np.shape(system.q) != (system.size,):
         return Refused("not one vector")
     if friction.needs == "bodies" and not system.bodies:
         return frozenset()  # without a closed form, it is a force

@@ -4,6 +4,7 @@ import functools
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -63,12 +64,12 @@ def _as_array(form: Form, p: PyTree, name: str) -> Any:
     """An operator as its matrix."""
     if not is_operator(form):
         return form
-    structure = jtu.tree_structure(p)
-    if not jtu.treedef_is_leaf(structure) or jnp.ndim(p) != 1:
+    shapes = jtu.tree_map(jnp.shape, p)
+    if not eqx.is_array(p) or jnp.ndim(p) != 1:
         raise ValueError(
             f"{name} is an operator, which with friction per velocity needs positions "
-            f"and momenta in one vector, but `p` is {structure}. Write a matrix for "
-            "each leaf, or the friction as `MechanicalSystem(..., force=f)`."
+            f"and momenta in one vector, but `p` has shape {shapes}. Write a matrix "
+            "for each leaf, or the friction as `MechanicalSystem(..., force=f)`."
         )
     return form.as_matrix()  # pyright: ignore[reportOptionalMemberAccess]
 
