@@ -81,6 +81,22 @@ def test_wrappers_inside_compositions(wrap, compose):
         assert_close(one_step(wrap(compose(base))), expected, 1e-15)
 
 
+def test_gradients_where_the_solver_state_has_sums():
+    solver = dps.Compensated(dps.PresymplecticTao())
+    saveat = dfx.SaveAt(t0=True, ts=[0.7, 1.3])
+
+    def loss(adjoint):
+        def of(y0):
+            args = oscillator(), solver, 0.5, 1.5, 0.05, y0
+            sol = dfx.diffeqsolve(*args, saveat=saveat, adjoint=adjoint)
+            return sum(jnp.sum(jnp.sin(x)) for x in jax.tree.leaves(sol.ys))
+
+        return jax.jit(jax.grad(of))(Y0)
+
+    expected = loss(dfx.RecursiveCheckpointAdjoint())
+    assert_close(loss(dps.FixedStepAdjoint("checkpoints")), expected, 1e-12)
+
+
 @wrappers
 def test_wrappers_keep_what_the_scheme_has(wrap):
     euler = wrap(dps.PresymplecticEuler())

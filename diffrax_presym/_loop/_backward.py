@@ -17,6 +17,11 @@ from .._scheme._engine import prepare, Span, vjp, vjp_step
 from ._run import end_is_separate, Problem, Trace
 
 
+def _zeros(x: PyTree) -> PyTree:
+    """The cotangent zero, for which a `tree.Sum` is two arrays."""
+    return jtu.tree_map(jnp.zeros_like, x)
+
+
 class Position(eqx.Module):
     """How far the backward pass has come."""
 
@@ -80,9 +85,9 @@ class Backward(eqx.Module):
         at = Position(
             n,
             point,
-            (tree.zeros(point[0]), self.carry_bar),
-            tree.zeros(moved),
-            tree.zeros(eqx.filter(self.shared, eqx.is_inexact_array)),
+            (_zeros(point[0]), self.carry_bar),
+            _zeros(moved),
+            _zeros(eqx.filter(self.shared, eqx.is_inexact_array)),
             [jnp.sum(rows.reached(n)) for rows in problem.rows],
         )
         pulls = []
@@ -94,9 +99,9 @@ class Backward(eqx.Module):
             pull = partial(self._pull_row, i)
             if len(rows) and problem.at_once:
                 more, starts = self._pull_rows(i)
-                at = at.add(more, tree.zeros(at.bar))
+                at = at.add(more, _zeros(at.bar))
                 pull = lambda at, j, starts=starts: (
-                    tree.zeros(at.gradient),
+                    _zeros(at.gradient),
                     jtu.tree_map(lambda x: x[j], starts),
                 )
             pulls.append(pull)
@@ -111,7 +116,7 @@ class Backward(eqx.Module):
         if self.shared is None:
             return at
         gradient = self._pull_prepared(self.problem.prepare, at.shared)
-        return at.add(gradient, tree.zeros(at.bar))
+        return at.add(gradient, _zeros(at.bar))
 
     def back_to(
         self, at: Position, pulls: list[Callable], first: Array, start: Callable
@@ -174,7 +179,7 @@ class Backward(eqx.Module):
             args = system, wanted, span, data, start, at.bar
             more, prepared, bar = vjp(moves, *args)
         moved, _ = self._parameters
-        gradient = tree.sum(at.gradient, (more, tree.zeros(moved[1])))
+        gradient = tree.sum(at.gradient, (more, _zeros(moved[1])))
         shared = at.shared
         if once:
             prepared = eqx.filter(prepared, eqx.is_inexact_array)
@@ -210,7 +215,7 @@ class Backward(eqx.Module):
             return eqx.filter(fns[i](t, y, system.args), eqx.is_inexact_array)
 
         gradient, y_bar = jax.vjp(output, moved, y)[1](bar)
-        return gradient, (y_bar, tree.zeros(carry))
+        return gradient, (y_bar, _zeros(carry))
 
     def _pull_row(self, i: int, at: Position, j: Array):
         """Pull back one row of an output, from the start of its step."""
