@@ -190,7 +190,8 @@ def check_order(run: Run, claimed: float, rounding: float):
     # The errors of Tao's copies oscillate.
     number = 6 if run.row["scheme"].name.startswith("Tao") else 3
     last = sorted(errors)[-number:]
-    if len(last) < 3 or errors[last[0]] < 30 * rounding:
+    drop = (last[-1] / last[0]) ** claimed
+    if len(last) < 3 or errors[last[0]] < max(30, 5 * drop) * rounding:
         # Too accurate for its order to be seen.
         return
     x, y = np.log(last), np.log([errors[n] for n in last])
@@ -279,7 +280,7 @@ def check(row: dict):
     assert not isinstance(claimed, Refused)
     if way.name == "unequal steps" and scheme.name.startswith("multistep"):
         claimed = min(claimed, 8)  # all steps are those of the start
-    if way.name not in LATE and friction.limit is not None and claimed <= 2:
+    if way.name not in LATE and friction.limit is not None:
         claimed = min(claimed, 1)  # within the first step after a singular start
     run = Run(row, row["gradient"].adjoint(), "float64")
     if catalogue.fails(*combined):
