@@ -65,7 +65,7 @@ def test_prepared_friction_solves_its_equation(law, rate):
     net = friction.net_force(jnp.asarray(t), jnp.asarray(force), jnp.asarray(p0))
     np.testing.assert_allclose(net, force - rate(t) @ p0, 1e-12)
     prepared = friction.prepare(jnp.asarray(t), jnp.asarray(H), 12)
-    for data in (prepared, friction.fix(prepared)):
+    for data in (prepared, *friction.fix([prepared])):
         change, carried = friction.flow(data, jnp.asarray(p0))
         np.testing.assert_allclose(p0 + change, left, 1e-10)
         np.testing.assert_allclose(carried, travelled, 1e-10)

@@ -100,8 +100,8 @@ def exponentials(
     # Loops rather than code for each term, which takes long to compile.
     power = lambda x, _: (_product(x, z), x)
     _, powers = lax.scan(power, one, None, length=_TERMS + 1)
-    factorials = [float(math.factorial(k + 1)) for k in range(_TERMS)]
-    terms = jnp.stack([fractions**k / f for k, f in enumerate(factorials)], axis=1)
+    factorials = np.array([[math.factorial(k + 1) for k in range(_TERMS)]], z.dtype)
+    terms = fractions[:, None] ** np.arange(_TERMS, dtype=z.dtype)[None] / factorials
     combine = lambda c, x: jnp.tensordot(c, x, 1, precision="highest")
     mean = combine(terms, powers[:-1])
     change = combine(fractions[:, None] * terms, powers[1:])

@@ -1,9 +1,11 @@
 """Linear friction of one leaf: rates of its entries, or one that couples them."""
 
 import functools
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Inexact
 
 from .._forms import matvec
@@ -27,8 +29,8 @@ class EntryFriction(eqx.Module):
             return law.effect(rate, t, h, order)
         return by_quadrature(self.terms, t, h, order)
 
-    def fix(self, effect: Effect) -> Effect:
-        return effect
+    def fix(self, effects: Sequence[Effect]) -> Sequence[Effect]:
+        return effects
 
     def decay(self, effect: Effect, p: Array) -> Array:
         return cast_to(effect.change, p) * p
@@ -71,12 +73,15 @@ class MatrixFriction(eqx.Module):
     def prepare(self, t: Time, h: Time, order: int) -> Effect:
         return Effect(*[as_time(h)] * 3)
 
-    def fix(self, effect: Effect) -> Effect:
-        x = effect.change
-        matrix = cast_to(self.matrix, x)
-        both = exponentials(matrix, jnp.ravel(x))
-        change, carried = (y.reshape(*x.shape, *matrix.shape) for y in both)
-        return Effect(change, carried, carried)
+    def fix(self, effects: Sequence[Effect]) -> list[Effect]:
+        times = [effect.change for effect in effects]
+        matrix = cast_to(self.matrix, times[0])
+        # All at once: the exponentials take longer to compile than the rest of a step.
+        both = exponentials(matrix, jnp.concatenate(list(map(jnp.ravel, times))))
+        ends = np.cumsum([x.size for x in times])[:-1]
+        parts = zip(times, *(jnp.split(y, ends) for y in both), strict=True)
+        shape = lambda x, y: y.reshape(*x.shape, *matrix.shape)
+        return [Effect(shape(x, a), shape(x, b), shape(x, b)) for x, a, b in parts]
 
     def flow(self, effect: Effect, p: Array) -> tuple[Array, Array]:
         if jnp.ndim(effect.change):

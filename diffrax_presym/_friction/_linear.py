@@ -51,12 +51,16 @@ class LinearFriction(eqx.Module):
         prepare = lambda leaf: leaf.prepare(t, h, order)
         return Effects(jtu.tree_map(prepare, self.leaves, is_leaf=_is_leaf))
 
-    def fix(self, effects: Effects) -> Effects:
+    def fix(self, effects: list[Effects]) -> list[Effects]:
         """What was prepared for many spans at once, to be applied many times: matrices
         are exponentiated."""
-        if effects.is_fixed:
-            return effects
-        return Effects(self._map("fix", effects.leaves), is_fixed=True)
+        fix = lambda leaf, *each: leaf.fix(each)
+        each = [x.leaves for x in effects]
+        fixed = jtu.tree_map(fix, self.leaves, *each, is_leaf=_is_leaf)
+        part = lambda i: jtu.tree_map(
+            lambda _, x: x[i], self.leaves, fixed, is_leaf=_is_leaf
+        )
+        return [Effects(part(i), is_fixed=True) for i in range(len(effects))]
 
     def flow(self, effects: Effects, p: PyTree) -> tuple[PyTree, PyTree]:
         """The change of `p` by friction alone, and the integral of `p` meanwhile."""

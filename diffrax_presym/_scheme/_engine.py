@@ -160,9 +160,11 @@ def prepare_once(
     data, friction = prepare(moves, system, span, backward), system.friction
     if friction is None:
         return data
-    is_leaf = lambda x: isinstance(x, Effects)
-    fixed = lambda x: friction.fix(x) if is_leaf(x) else x
-    return jtu.tree_map(fixed, data, is_leaf=is_leaf)
+    is_effects = lambda x: isinstance(x, Effects) and not x.is_fixed
+    leaves, structure = jtu.tree_flatten(data, is_leaf=is_effects)
+    fixed = iter(friction.fix(list(filter(is_effects, leaves))))
+    leaves = [next(fixed) if is_effects(x) else x for x in leaves]
+    return structure.unflatten(leaves)
 
 
 def _unless_amplified(system: System, span: Span, data: PyTree) -> PyTree:

@@ -59,7 +59,7 @@ class Collocation(AbstractMove):
         lengths = jnp.concatenate([lengths, to_middle, -to_middle])
         friction = system.friction
         decays = jax.vmap(lambda t, h: friction.prepare(t, h, 1))(starts, lengths)
-        effects = friction.fix(decays)
+        (effects,) = friction.fix([decays])
         rows = lambda rows: jtu.tree_map(lambda x: x[rows], effects)
         inwards, outwards = slice(3, 3 + len(nodes)), slice(3 + len(nodes), None)
         parts = map(rows, [0, 1, 2, inwards, outwards])
