@@ -1,8 +1,9 @@
 """Error against time, of solves that a user gives."""
 
+import functools
 import statistics
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -141,14 +142,15 @@ def work_precision(
             "`work_precision` needs at least one solve and a positive tolerance: "
             "`work_precision({name: solve}, t0, t1, rtol=1e-6, atol=1e-6)`."
         )
-    span = t1 - t0
-    run = lambda solve, n: Solution.of(n, solve, span / n)
-    goal = 10.0**-decades
-    finest = {}
-    for name, solve in solves.items():
-        found = _converged(lambda n, f=solve: run(f, n), tolerance, goal, max_steps)
-        if found is not None:
-            finest[name] = found
+    span, goal = t1 - t0, 10.0**-decades
+    finest = {
+        name: _converged(
+            lambda n, solve=solve: Solution.of(n, solve, span / n),
+            *(tolerance, goal, max_steps),
+        )
+        for name, solve in solves.items()
+    }
+    finest = {name: x for name, x in finest.items() if x is not None}
     if not finest:
         raise RuntimeError(
             f"No solve converges to {goal:.0e} of the tolerance with up to {max_steps} "
@@ -156,30 +158,34 @@ def work_precision(
         )
     reference = _agreed(finest, tolerance)
     exact = finest[reference].leaves
-    window = lambda error: goal / 10 <= error <= 1 / goal
-    measured, calls = [], []
-
-    def measure(name: str, solve: Solve, settings: Iterable[tuple[int, float]]) -> None:
-        for number, x in settings:
-            solution = Solution.of(number, solve, x)
-            error = _error(solution, exact, tolerance)
-            if window(error):
-                measured.append((name, error, solution.steps, x))
-                calls.append(lambda x=x: solve(x))
-            if error < goal:
-                break
-
-    for name, solve in solves.items():
-        measure(name, solve, ((n, span / n) for n in _ladder(max_steps)))
+    steps = [(n, span / n) for n in _ladder(max_steps)]
     levels = [tolerance[0] / goal * 10 ** (-k / 2) for k in range(4 * decades + 5)]
-    for name, solve in (adaptive or {}).items():
-        measure(name, solve, ((0, level) for level in levels))
+    tasks = [(*x, steps) for x in solves.items()]
+    tasks += [(*x, [(0, level) for level in levels]) for x in (adaptive or {}).items()]
+    measured, calls = [], []
+    for name, solve, settings in tasks:
+        for error, number, x in _measured(solve, settings, exact, tolerance, goal):
+            measured.append((name, error, number, x))
+            calls.append(functools.partial(solve, x))
     rows = zip(measured, _medians(calls, repeats), strict=True)
     runs = tuple(
-        WorkPrecisionRun(name, error, seconds, steps, x)
-        for (name, error, steps, x), seconds in rows
+        WorkPrecisionRun(name, error, seconds, number, x)
+        for (name, error, number, x), seconds in rows
     )
     return WorkPrecision(runs, reference)
+
+
+def _measured(
+    solve: Solve, settings, exact: list[np.ndarray], tolerance, goal: float
+) -> Iterator[tuple[float, int, float]]:
+    """The errors around the tolerance, the numbers of steps and the settings."""
+    for number, x in settings:
+        solution = Solution.of(number, solve, x)
+        error = _error(solution, exact, tolerance)
+        if goal / 10 <= error <= 1 / goal:
+            yield error, solution.steps, x
+        if error < goal:
+            return
 
 
 def _ladder(max_steps: int):
