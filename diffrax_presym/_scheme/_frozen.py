@@ -149,7 +149,7 @@ class PresymplecticLeapfrog(AbstractPresymplecticSolver):
             A = _momentum_first(self, system, known)
             moves = Stages([A, inverse(A)], halves)
             if not known:
-                return Scheme(moves)
+                return Scheme(moves, is_implicit=True)
             force = lambda system, t, y: system.force(t, y)
             return Scheme(moves, start=force, end_force=lambda carry: carry)
         A = _momentum_first(self, system)
