@@ -30,7 +30,7 @@ def by_matrix(t):
     return flow @ np.concatenate(Y0)
 
 
-@pytest.mark.parametrize("adjoint", [None, dps.FixedStepAdjoint()], ids=repr)
+@pytest.mark.parametrize("adjoint", [dps.FixedStepAdjoint(), None], ids=repr)
 @pytest.mark.parametrize(
     "solver",
     [dps.PresymplecticGauss(4), dps.Substeps(dps.PresymplecticGauss(3), 2)],
@@ -83,7 +83,7 @@ def test_saved_times_with_strong_friction(gamma):
     [(dps.BlanesMoanRKN4(), 100.0), (dps.BlanesMoan6(), 100.0)],
     ids=lambda x: getattr(type(x), "__name__", ""),
 )
-@pytest.mark.parametrize("adjoint", [None, dps.FixedStepAdjoint()], ids=repr)
+@pytest.mark.parametrize("adjoint", [dps.FixedStepAdjoint(), None], ids=repr)
 def test_stages_backwards_in_time_under_strong_friction(solver, gamma, adjoint):
     # A strongly damped joint among ordinary ones.
     rates = jnp.array([0.1, gamma])
@@ -172,3 +172,122 @@ def test_a_step_that_is_too_large_is_a_failure(saveat):
     )
     assert not np.all(np.isfinite(last(sol)[0]))
     assert sol.result != successful
+
+
+def mechanical(friction, potential=harmonic, kinetic=None):
+    kinetic = dps.QuadraticKinetic() if kinetic is None else kinetic
+    return dps.MechanicalSystem(kinetic, potential, friction)
+
+
+def exact(system, t0, t1, y0):
+    controller = dfx.PIDController(rtol=1e-12, atol=1e-12)
+    problem = system, dfx.Dopri8(), t0, t1, 0.01, y0
+    return solve(*problem, stepsize_controller=controller, max_steps=20_000)
+
+
+def distance(a, b):
+    return max(float(jnp.max(jnp.abs(x - y))) for x, y in zip(a, b, strict=True))
+
+
+def test_an_entry_without_friction_beside_one_with_a_singularity():
+    system = mechanical(dps.LogDamping(jnp.array([3.0, 0.0])))
+    y0 = jnp.ones(2), jnp.array([0.0, 1.0])
+    q, p = last(solve(system, dps.TunedRKN6(), 0.0, 2.0, 0.1, y0))
+    assert abs(q[1] - (np.cos(2) + np.sin(2))) < 1e-10
+    assert abs(p[1] - (np.cos(2) - np.sin(2))) < 1e-10
+
+
+def test_equal_laws_of_both_energies_from_a_singularity():
+    law, y0 = dps.LogDamping(3.0), (jnp.ones(2), jnp.zeros(2))
+    general = dps.DissipativeHamiltonian(dps.QuadraticKinetic(), harmonic, law, law)
+    ends = [
+        last(solve(system, dps.TunedRKN6(), 0.0, 2.0, 0.1, y0))
+        for system in (general, mechanical(law))
+    ]
+    assert distance(*ends) < 1e-12
+
+
+@pytest.mark.parametrize("delta", [1.0, 2.0])
+def test_powers_without_a_singularity(delta):
+    system = mechanical(dps.PowerDamping(0.3, delta))
+    end = last(solve(system, dps.TunedRKN6(), 0.0, 2.0, 0.1, Y0))
+    assert distance(end, last(exact(system, 0.0, 2.0, Y0))) < 1e-9
+
+
+def test_friction_by_place_as_a_matrix_and_as_a_number():
+    matrix = lambda t, q, args: (1 + jnp.sum(q**2)) * jnp.asarray(C)
+    system = mechanical(dps.PositionDamping(matrix))
+    error = lambda n: distance(
+        last(solve(system, dps.BlanesMoan6(), 0.0, 2.0, 2 / n, Y0)),
+        last(exact(system, 0.0, 2.0, Y0)),
+    )
+    assert error(16) < 1e-6 and error(32) < error(16) / 30
+    y0 = {"a": Y0[0]}, {"a": Y0[1]}
+    potential = lambda t, q, args: jnp.sum(q["a"] ** 2) / 2
+    by_number = dps.PositionDamping(lambda t, q, args: 0.3)
+    q, p = last(
+        solve(mechanical(by_number, potential), dps.Strang(), 0.0, 1.0, 0.1, y0)
+    )
+    assert np.all(np.isfinite(q["a"]) & np.isfinite(p["a"]))
+
+
+@pytest.mark.parametrize("law", [dps.PositionDamping, dps.ViscousDamping, dps.Drag])
+def test_a_function_of_friction_that_returns_nothing(law):
+    y0 = jnp.ones((1, 2)), jnp.ones((1, 2))
+    system = mechanical(law(lambda t, q, args: None))
+    with pytest.raises(ValueError, match="returned None"):
+        solve(system, dps.Strang(), 0.0, 1.0, 0.1, y0)
+
+
+def test_friction_by_place_that_amplifies_too_much():
+    system = mechanical(dps.PositionDamping(lambda t, q, args: 200.0))
+    sol = solve(system, dps.BlanesMoan4(), 0.0, 10.0, 1.0, Y0, **END)
+    assert sol.result != successful
+
+
+@pytest.mark.parametrize("times", [[0.0, 3000.0], [0.0]])
+def test_the_energy_balance_over_long_times(times):
+    system, ts = mechanical(dps.ConstantDamping(1e-3)), jnp.array(times)
+    saveat = dfx.SaveAt(ts=ts)
+    ys = solve(
+        *(system, dps.TunedRKN6(), 0.0, 3000.0, 0.25, Y0),
+        **{"saveat": saveat, "adjoint": dps.FixedStepAdjoint(), "max_steps": None},
+    ).ys
+    error = dps.diagnostics.energy_error(system, ts, ys)
+    assert error.shape == ts.shape
+    assert np.max(np.abs(error)) < 1e-8
+
+
+def test_momenta_of_velocities():
+    matrix = jnp.array([[2.0, 0.3, 0.1], [0.3, 1.7, 0.2], [0.1, 0.2, 3.3]])
+    general = dps.Hamiltonian(lambda t, q, p, args: p @ matrix @ p / 2)
+    relativistic = mechanical(None, kinetic=dps.RelativisticKinetic(2.0, 3e8))
+    for system, size in ((general, 1e3), (relativistic, 1e8)):
+        for seed in range(4):
+            v = size * np.random.default_rng(seed).standard_normal(3) / 2
+            y = system.from_velocity(0.0, (jnp.zeros(3), jnp.asarray(v)))
+            np.testing.assert_allclose(system.to_velocity(0.0, y)[1], v, 1e-10)
+
+
+def test_steps_for_a_fast_force_and_for_times_in_single_precision():
+    fast = lambda t, q, args: jnp.sum(q**2) / 2 - 5 * jnp.sum(q) * jnp.cos(126 * t)
+    system = mechanical(dps.ConstantDamping(0.1), fast)
+    options = dict(adjoint=dps.FixedStepAdjoint(), max_steps=None)
+
+    def solve_by(dt0, dtype=float, saveat=None):
+        saveat = dfx.SaveAt(t1=True) if saveat is None else saveat
+        y0 = jax.tree.map(lambda x: x.astype(dtype), Y0)
+        problem = system, dps.TunedRKN6(), 0.0, 10.0, dt0, y0
+        return dfx.diffeqsolve(*problem, saveat=saveat, **options)
+
+    step = dps.choose_step(jax.jit(solve_by), 0.0, 10.0, rtol=1e-9, atol=1e-9)
+    assert step.steps < 1000
+    end = last(solve_by(step.dt0))
+    assert distance(end, last(exact(system, 0.0, 10.0, Y0))) < 1e-8
+    ts = np.linspace(0, 10, 101, dtype=np.float32)
+    system = mechanical(dps.ConstantDamping(0.1))
+    rough = lambda dt0: solve_by(dt0, jnp.float32, dfx.SaveAt(ts=jnp.asarray(ts)))
+    assert dps.choose_step(jax.jit(rough), 0.0, 10.0, rtol=1e-3, atol=1e-3).on_grid
+    batch = jax.vmap(solve_by, axis_size=2, in_axes=None)
+    with pytest.raises(ValueError, match="most difficult member"):
+        dps.choose_step(batch, 0.0, 10.0, rtol=1e-3, atol=1e-3)

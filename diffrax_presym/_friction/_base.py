@@ -35,6 +35,7 @@ class Linear(NamedTuple):
     log_scale: AbstractLogScale
     form: Form
     per_velocity: bool = False  # a coefficient, rather than a rate
+    may_couple: bool = False  # whether a rate may be a matrix
 
 
 class Parts(NamedTuple):

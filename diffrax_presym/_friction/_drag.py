@@ -11,7 +11,7 @@ from .._forms import fit_form, is_operator
 from .._numbers import cast_to, Time
 from ._base import AbstractFriction, MASS, Mechanics, Parts
 from ._damping import as_numbers, Numbers
-from ._viscous import needs_mass
+from ._viscous import arrays, needs_mass
 
 
 _COEFFICIENT = "`Drag(coefficient)`"
@@ -82,7 +82,7 @@ class Drag(AbstractFriction):
         """The drag with the coefficient and the medium at a place."""
 
         def value(x):
-            return jtu.tree_map(jnp.asarray, x(t, q, args)) if callable(x) else x
+            return arrays(x(t, q, args), "A function of `Drag`") if callable(x) else x
 
         numbers = value(self.coefficient), value(self.medium)
         where = lambda x: (x.coefficient, x.medium)

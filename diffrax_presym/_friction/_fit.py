@@ -52,7 +52,8 @@ def _rates(part: LinearPart, mechanics: Mechanics, p: PyTree) -> list[Array]:
         mass = fit_form(_as_array(mechanics.mass, p, MASS), p, MASS, "p")
         rows = zip(rates, jtu.tree_leaves(mass), like, strict=True)
         return [_per_momentum(*row) for row in rows]
-    if any(is_matrix(x, xi) for x, xi in zip(rates, like, strict=True)):
+    couples = any(is_matrix(x, xi) for x, xi in zip(rates, like, strict=True))
+    if couples and not part.may_couple:
         raise ValueError(
             "The damping is a matrix that couples the entries of `p`. Friction by a "
             "matrix is given per velocity: write `ViscousDamping(matrix)`."

@@ -54,6 +54,8 @@ class LinearFriction(eqx.Module):
     def fix(self, effects: list[Effects]) -> list[Effects]:
         """What was prepared for many spans at once, to be applied many times: matrices
         are exponentiated."""
+        if not effects:
+            return []
         fix = lambda leaf, *each: leaf.fix(each)
         each = [x.leaves for x in effects]
         fixed = jtu.tree_map(fix, self.leaves, *each, is_leaf=_is_leaf)

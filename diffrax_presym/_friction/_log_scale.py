@@ -152,6 +152,8 @@ class Logarithm(AbstractLogScale):
         start = jnp.where(singular, 0, since)
         x, h, rate = self.increment(t, h), as_time(h), cast_to(rate, since)
         carried = start * x * expm1_ratio((1 - rate) * x)
+        # What has no friction is carried from the singularity on too.
+        carried = jnp.where(singular & (rate == 0), h, carried)
         responded = (start + h) * x * expm1_ratio(-(1 + rate) * x)
         return Effect(expm1(-rate * x), carried, responded)
 
@@ -187,10 +189,12 @@ class Power(AbstractLogScale):
 
     def rate(self, t: Time) -> Scalar:
         zero, since, delta = self._parameters(t)
-        return jnp.where(zero, jnp.inf, delta * since ** (delta - 1))
+        first = jnp.where(delta == 1, 1, jnp.where(delta < 1, jnp.inf, 0))
+        return jnp.where(zero, first, delta * since ** (delta - 1))
 
     def is_singular(self, t: Time) -> Bool[Array, ""]:
-        return as_time(t) == 0
+        zero, _, delta = self._parameters(t)
+        return zero & jnp.any(delta < 1)
 
 
 class FunctionOfTime(AbstractLogScale):

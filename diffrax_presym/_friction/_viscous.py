@@ -1,9 +1,10 @@
 """Friction by coefficients, the force per velocity, and friction by place."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import PyTree
 
 from .. import _tree as tree
@@ -37,6 +38,13 @@ def needs_mass(mechanics: Mechanics, name: str) -> None:
         )
 
 
+def arrays(form: PyTree, name: str) -> PyTree:
+    """What a function returned, as arrays."""
+    if form is None:
+        raise ValueError(f"{name} must return numbers, but returned None.")
+    return jtu.tree_map(jnp.asarray, form)
+
+
 class ViscousFriction(AbstractFriction):
     """Linear friction by constant coefficients, part of every drift."""
 
@@ -67,8 +75,11 @@ class LocalFriction(AbstractFriction):
 
     def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
         x, name = (v, COEFFICIENTS) if self.per_velocity else (p, DAMPING)
-        form: Any = self.form(t, q, args)
-        return tree.scale(-1, multiply(form, x, name, "p"))
+        return tree.scale(-1, multiply(self.at(t, q, args), x, name, "p"))
+
+    def at(self, t: Time, q: PyTree, args: PyTree) -> PyTree:
+        """The coefficients or rates at a time and a place."""
+        return arrays(self.form(t, q, args), "The function of friction")
 
 
 def ViscousDamping(coefficients) -> ViscousFriction | LocalFriction:

@@ -64,21 +64,31 @@ class Solution(NamedTuple):
                 "The solve must return a `diffrax.Solution`, the result of "
                 f"`diffeqsolve`, but returned {type(sol).__name__}."
             )
-        times = [np.asarray(t, float) for t in jax.tree.leaves(sol.ts)]
+        if np.ndim(sol.stats["num_steps"]):
+            raise ValueError(
+                "The solve must be of one problem, but it is a batch. Choose the step "
+                "for its most difficult member."
+            )
+        times = [np.asarray(t) for t in jax.tree.leaves(sol.ts)]
+        if not times:
+            raise ValueError(
+                "The solve must save at some times, for example by `SaveAt(t1=True)`, "
+                "to find its error."
+            )
         values = [np.asarray(y) for y in jax.tree.leaves(sol.ys)]
         good = (dfx.RESULTS.successful, dfx.RESULTS.event_occurred)
         finite = any(bool(sol.result == x) for x in good)
         if finite and not all(np.all(np.isfinite(t)) for t in times):
             raise ValueError(
                 "The solve must save at times that do not depend on the step. Write "
-                "`SaveAt(t1=True)` or `SaveAt(ts=ts)`."
+                "`SaveAt(t1=True)` or `SaveAt(ts=ts)`; with an event, the first."
             )
         finite = finite and all(np.all(np.isfinite(y)) for y in values)
         order = sol.stats.get("order")
         return cls(
             number,
             int(sol.stats["num_steps"]),
-            np.concatenate([np.ravel(t) for t in times]) if times else np.zeros(0),
+            np.concatenate([np.ravel(t) for t in times]),
             [*values, *times],
             finite,
             None if order is None else int(order),
@@ -166,7 +176,7 @@ class Convergence:
                 self.order = math.nan
             return True
         both = before, self.order
-        if all(x >= 0.75 for x in both) and abs(before / self.order - 1) < 0.25:
+        if min(both) >= self._least_order and abs(before / self.order - 1) < 0.25:
             self._check_affordable(coarse.steps, error)
         self._check_rounding(regular or slow, coarse, solution)
         return False

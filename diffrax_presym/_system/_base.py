@@ -2,6 +2,7 @@ import abc
 from collections.abc import Callable
 
 import diffrax as dfx
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
@@ -205,7 +206,11 @@ def check_state(y: PyTree) -> None:
 def momentum_of(system: AbstractSystem, t: Time, q: Q, v: Q, args: PyTree) -> State:
     """The state of positions and velocities, by Newton's method from the momentum that
     is equal to the velocity."""
-    residual = lambda p, _: tree.sub(system.velocity(t, q, p, args), v)
     eps = max(float(jnp.finfo(x.dtype).eps) for x in jtu.tree_leaves(v))
+    size = lax.stop_gradient(tree.largest(v))
+    # Relative to the velocity, so that the tolerance is its rounding.
+    unit = jnp.where(size > 0, 1 / size, 1)
+    miss = lambda p: tree.sub(system.velocity(t, q, p, args), v)
+    residual = lambda p, _: tree.scale(unit, miss(p))
     finder = optx.Newton(rtol=10 * eps, atol=10 * eps)
     return q, optx.root_find(residual, finder, v).value

@@ -171,6 +171,11 @@ class RelativisticKinetic(AbstractKinetic):
         p, square, rest, unit = self._scaled(p)
         return tree.scale(cast_to(self.speed, unit) / jnp.sqrt(square + rest), p)
 
+    def momentum(self, v: PyTree) -> PyTree:
+        """The momentum of a velocity below the speed of light."""
+        square = tree.dot(*(tree.scale(1 / self.speed, v),) * 2)
+        return tree.scale(cast_to(self.mass, square) / jnp.sqrt(1 - square), v)
+
     def prepare(self, friction, t, h, order):
         return prepare_quadrature(friction, t, h, order)
 

@@ -12,7 +12,12 @@ from .._friction._damping import as_laws
 from .._friction._fit import has_one_rate
 from .._numbers import Scalar, Time
 from ._base import AbstractSystem, momentum_of, P, Q
-from ._kinetic import AbstractKinetic, as_kinetic, QuadraticKinetic
+from ._kinetic import (
+    AbstractKinetic,
+    as_kinetic,
+    QuadraticKinetic,
+    RelativisticKinetic,
+)
 from ._mechanical_splits import KineticSplit, LocalSplit, PotentialSplit, SharedSplit
 from ._potential import AbstractPotential, as_potential, QuadraticPotential
 from ._split import AbstractSplit
@@ -131,7 +136,7 @@ class MechanicalSystem(AbstractSystem):
         self, t: Time, y: tuple[Q, Q], args: PyTree = None
     ) -> tuple[Q, P]:
         """The state `(q, p)` of positions and velocities `(q, v)`."""
-        if isinstance(self.kinetic, QuadraticKinetic):
+        if isinstance(self.kinetic, QuadraticKinetic | RelativisticKinetic):
             return y[0], self.kinetic.momentum(y[1])
         return momentum_of(self, t, *y, args)
 

@@ -1,5 +1,6 @@
 """The splits of mechanical systems."""
 
+import math
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -15,7 +16,7 @@ from .._friction._base import Linear
 from .._friction._drag import Drag
 from .._friction._fit import fit_friction
 from .._friction._log_scale import Linear as LinearScale
-from .._numbers import State, Time
+from .._numbers import as_time, State, Time
 from ._split import AbstractSplit
 
 
@@ -69,7 +70,7 @@ class LocalSplit(AbstractSplit):
     def force(self, system, t, y) -> PyTree:
         """The force, and the numbers of the friction at the place."""
         parts, at = system.term.parts, (t, tree.values(y)[0], system.args)
-        forms = [jtu.tree_map(jnp.asarray, part.form(*at)) for part in parts.local]
+        forms = [part.at(*at) for part in parts.local]
         drags = [drag.at(*at) for drag in parts.drags]
         numbers = [(drag.coefficient, drag.medium) for drag in drags]
         return _potential_force(system, t, y), forms, numbers
@@ -78,7 +79,10 @@ class LocalSplit(AbstractSplit):
         (force, forms, numbers), p = force, tree.values(y)[1]
         parts, mechanics = system.term.parts, system.term.mechanics
         pairs = zip(parts.local, forms, strict=True)
-        linear = [Linear(LinearScale(), x, part.per_velocity) for part, x in pairs]
+        linear = [
+            Linear(LinearScale(), x, part.per_velocity, may_couple=True)
+            for part, x in pairs
+        ]
         friction = fit_friction(linear, mechanics, p)
         where = lambda drag: (drag.coefficient, drag.medium)
         pairs = zip(parts.drags, numbers, strict=True)
@@ -89,7 +93,11 @@ class LocalSplit(AbstractSplit):
                 return tree.add(dp, h, force)
             data = friction.prepare(t, h, order)
             gained = friction.decay(data, tree.sum(p, dp))
-            return tree.sum(dp, tree.sum(gained, friction.respond(data, force)))
+            # As in drifts, a stage back in time must not amplify rounding too much.
+            most, back = 1 / math.sqrt(friction.precision), as_time(h) < 0
+            lost = back & (friction.amplification(t, -as_time(h)) > most)
+            new = tree.sum(dp, tree.sum(gained, friction.respond(data, force)))
+            return jtu.tree_map(lambda x: jnp.where(lost, jnp.nan, x), new)
 
         def slowed(drags: list[Drag], dp: PyTree, h: Time) -> PyTree:
             for drag in drags:

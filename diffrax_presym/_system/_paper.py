@@ -1,5 +1,6 @@
 """The families of Hamiltonians of the paper, as systems."""
 
+import math
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from .._friction._base import Mechanics, Parts
 from .._friction._damping import as_laws, ConstantDamping, Damping
 from .._friction._fit import fit_friction, one_rate
 from .._friction._linear import LinearFriction
-from .._numbers import Scalar, Time
+from .._numbers import as_time, Scalar, Time
 from ._energy import Hamiltonian
 from ._kinetic import (
     AbstractKinetic,
@@ -123,11 +124,14 @@ class _ScaledKinetic(AbstractKinetic):
         return self.kinetic.is_quadratic
 
     def _parts(self, t: Time):
-        # Where it is minus infinity, as of 3 / t at zero, it has no derivatives.
-        infinite = jnp.isneginf(self.eta2(t))
-        eta2 = self.eta2(jnp.where(infinite, t + 1, t))
-        eta2 = jnp.where(infinite, -jnp.inf, eta2)
-        return jnp.exp(eta2 - self.eta1(t)), self.kinetic.rescale(eta2)
+        # Where it is minus infinity, as of 3 / t at zero, it has no derivatives, and
+        # what is just after it is the limit of the difference.
+        infinite, t = jnp.isneginf(self.eta2(t)), as_time(t)
+        just = math.sqrt(float(jnp.finfo(t.dtype).tiny))
+        near = jnp.where(infinite, t + just, t)
+        eta1, eta2 = self.eta1(near), self.eta2(near)
+        rescaled = self.kinetic.rescale(jnp.where(infinite, -jnp.inf, eta2))
+        return jnp.exp(eta2 - eta1), rescaled
 
     def __call__(self, t: Time, p: PyTree, args: PyTree = None) -> Scalar:
         scale, kinetic = self._parts(t)

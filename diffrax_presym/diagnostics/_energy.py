@@ -15,6 +15,8 @@ from .._system._base import AbstractSystem
 
 
 Times = Inexact[Array, " times"]
+# Between two saved times, of the integral of a power.
+_MAX_STEPS = 100_000
 
 
 def energy(system: AbstractSystem, ts: Times, ys: State, args: PyTree = None) -> Times:
@@ -48,7 +50,8 @@ def energy_error(
     where $v$ is the velocity and $F$ the force that has no potential:
     $-\dot \eta \, p$ for a damping law. The error is the left side minus the right. The
     integral is along the exact motion from each saved state to the next time, by
-    `diffrax.Dopri8` to rounding, so that the error is that of the solution alone.
+    `diffrax.Dopri8` to rounding, so that the error is that of the solution alone. It is
+    NaN where that fails.
 
     **Arguments:**
 
@@ -119,14 +122,16 @@ def _integral(
             dfx.Dopri8(),
             *(t0, t1, None, (y0, zero)),
             stepsize_controller=dfx.PIDController(rtol=tolerance, atol=tolerance),
+            max_steps=_MAX_STEPS,
             throw=False,
         )
         assert sol.ys is not None
-        return sol.ys[1][0]
+        good = sol.result == dfx.RESULTS.successful
+        return jnp.where(good, sol.ys[1][0], jnp.nan)
 
     starts = jtu.tree_map(lambda y: y[:-1], ys)
     parts = eqx.filter_jit(jax.vmap(one))(ts[:-1], ts[1:], starts)
-    return jnp.concatenate([jnp.zeros_like(parts[:1]), jnp.cumsum(parts)])
+    return jnp.concatenate([jnp.zeros(1, parts.dtype), jnp.cumsum(parts)])
 
 
 def _at_each(fn: Callable, ts: Times, ys: State):

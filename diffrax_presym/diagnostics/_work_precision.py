@@ -159,7 +159,8 @@ def work_precision(
     reference = _agreed(finest, tolerance)
     exact = finest[reference].leaves
     steps = [(n, span / n) for n in _ladder(max_steps)]
-    levels = [tolerance[0] / goal * 10 ** (-k / 2) for k in range(4 * decades + 5)]
+    coarse = (tolerance[0] or tolerance[1]) / goal
+    levels = [coarse * 10 ** (-k / 2) for k in range(4 * decades + 5)]
     tasks = [(*x, steps) for x in solves.items()]
     tasks += [(*x, [(0, level) for level in levels]) for x in (adaptive or {}).items()]
     measured, calls = [], []
@@ -178,12 +179,15 @@ def work_precision(
 def _measured(
     solve: Solve, settings, exact: list[np.ndarray], tolerance, goal: float
 ) -> Iterator[tuple[float, int, float]]:
-    """The errors around the tolerance, the numbers of steps and the settings."""
+    """The errors around the tolerance, the numbers of steps and the settings; at least
+    those of the fastest that is accurate."""
+    least = 0.0
     for number, x in settings:
         solution = Solution.of(number, solve, x)
         error = _error(solution, exact, tolerance)
-        if goal / 10 <= error <= 1 / goal:
+        if least <= error <= 1 / goal:
             yield error, solution.steps, x
+            least = goal / 10
         if error < goal:
             return
 
