@@ -291,3 +291,63 @@ def test_steps_for_a_fast_force_and_for_times_in_single_precision():
     batch = jax.vmap(solve_by, axis_size=2, in_axes=None)
     with pytest.raises(ValueError, match="most difficult member"):
         dps.choose_step(batch, 0.0, 10.0, rtol=1e-3, atol=1e-3)
+
+
+def pendulum(k):
+    return mechanical(None, lambda t, q, args: k * jnp.sum(1 - jnp.cos(q)))
+
+
+def slope(fn, x, h=1e-5):
+    return (fn(x + h) - fn(x - h)) / (2 * h)
+
+
+def solved(system, solver, t1=1.0, dt0=0.1, y0=Y0, **options):
+    options = {"adjoint": dps.FixedStepAdjoint(), "max_steps": 64} | options
+    return dfx.diffeqsolve(system, solver, 0.0, t1, dt0, y0, **options).ys
+
+
+def test_gradients_of_a_force_that_ends_with_the_solve():
+    def loss(k):
+        force = dps.ForceField(lambda t, q, args: -k * q * jnp.sqrt(1 - t))
+        saveat = dfx.SaveAt(ts=jnp.array([0.35, 1.0]))
+        leapfrog = dps.PresymplecticLeapfrog()
+        return jnp.sum(solved(mechanical(None, force), leapfrog, saveat=saveat)[0])
+
+    np.testing.assert_allclose(jax.grad(loss)(1.3), slope(loss, 1.3), 1e-7)
+
+
+def test_gradients_of_rows_that_are_not_reached():
+    def loss(x):
+        q0 = Y0[0] + x
+        fn = lambda t, y, args: jnp.linalg.norm(y[0] - q0)
+        saveat = dfx.SaveAt(steps=True, fn=fn)
+        y0, leapfrog = (q0, Y0[1]), dps.PresymplecticLeapfrog()
+        return jnp.sum(solved(pendulum(1.3), leapfrog, y0=y0, saveat=saveat)[:10])
+
+    np.testing.assert_allclose(jax.grad(loss)(0.2), slope(loss, 0.2), 1e-7)
+
+
+def test_saved_times_within_several_steps_of_a_multistep_method():
+    ts = jnp.array([3.0, 7.5, 14.0, 20.0])
+    solve_by = lambda solver, dt0: solved(
+        pendulum(1.0), solver, 20.0, dt0, saveat=dfx.SaveAt(ts=ts), max_steps=None
+    )
+    several = solve_by(dps.Substeps(dps.SymmetricMultistep(), 50), 5.0)
+    assert distance(several, solve_by(dps.TunedRKN6(), 0.1)) < 1e-7
+
+
+def test_a_multistep_method_with_given_times_across_zero():
+    ts = jnp.linspace(-10.0, 10.0, 401)
+    options = dict(stepsize_controller=dfx.StepTo(ts), adjoint=dps.FixedStepAdjoint())
+
+    def loss(k):
+        problem = pendulum(k), dps.SymmetricMultistep(), ts[0], ts[-1], None, Y0
+        return jnp.sum(last(dfx.diffeqsolve(*problem, **options))[0])
+
+    np.testing.assert_allclose(jax.grad(loss)(1.3), slope(loss, 1.3), 1e-5)
+
+
+def test_a_scheme_is_compensated_once():
+    inner = dps.Substeps(dps.Compensated(dps.TunedRKN6()), 2)
+    with pytest.raises(ValueError, match="Remove one"):
+        dps.Compensated(inner)

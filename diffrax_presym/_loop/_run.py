@@ -100,9 +100,11 @@ class Problem(eqx.Module):
         last, begin, end = (self.steps.time(n + i) for i in (-1, 0, 1))
         # A batch computes the shorter step at the start of a step too, and after the
         # last one. Its result is not used, but it must be one that succeeds: half of a
-        # step, as friction that is singular at its start would not allow none.
-        length = jnp.where(end > begin, end - begin, begin - last)
-        length = jnp.where(length > 0, length, 1)
+        # step, the last one at the end of the solve, as friction that is singular at
+        # its start would not allow none.
+        ended = end <= begin
+        begin, end = jnp.where(ended, last, begin), jnp.where(ended, begin, end)
+        length = jnp.where(end > begin, end - begin, 1)
         t = jnp.where(inside, t, begin + length / 2)
         times = system.time(begin), system.time(t)
         step = lambda: between(self.scheme, system, times[0], start, times[1])
@@ -136,17 +138,20 @@ class Problem(eqx.Module):
         """What output `i` saves in all rows, from the states at the starts of their
         steps; of `n` steps."""
         (system, fns), rows = parameters, self.rows[i]
-        # Of rows that are not reached nothing may fail.
+        # Rows that are not reached repeat the first, or what is saved at the start, so
+        # that nothing fails of which a gradient takes zero times.
         reached = rows.reached(n)
-        time = jnp.where(reached, rows.time, self.steps.t0)
-        stop = jnp.where(reached, rows.stop, 0)
-        inside = reached & rows.inside
+        row, some = jnp.where(reached, jnp.arange(len(rows)), 0), reached[0]
+        starts = jtu.tree_map(lambda x: x[row], starts)
+        time = jnp.where(some, rows.time[row], self.steps.t0)
+        stop = jnp.where(some, rows.stop[row], 0)
+        inside = some & rows.inside[row]
         ys = starts[0]
         if rows.may_be_inside:
             each = jax.vmap(partial(self.between, system))
             # At once, a time that is the end of a step would cost as much as others.
             within = lambda: each(stop, starts, time, inside)
-            ys = lax.cond(jnp.any(inside), within, lambda: starts[0])
+            ys = lax.cond(jnp.any(inside), within, lambda: ys)
         values = jax.vmap(lambda t, y: fns[i](t, y, system.args))(time, ys)
         return values, jax.vmap(tree.all_finite)(ys)
 

@@ -45,10 +45,18 @@ class Compensated(AbstractPresymplecticSolver):
 
         **Raises:**
 
-        `ValueError` if it is not one; and when the solve is traced, if the system
-        updates its states otherwise than by sums.
+        `ValueError` if it is not one, or is compensated itself; and when the solve is
+        traced, if the system updates its states otherwise than by sums.
         """
         check_base(base)
+        inner = base
+        while inner is not None:
+            if isinstance(inner, Compensated):
+                raise ValueError(
+                    f"`Compensated(base)` takes a scheme that is not compensated, but "
+                    f"got {base!r}. Remove one of the two."
+                )
+            inner = getattr(inner, "base", None)
         self.base = base
 
     @property

@@ -6,11 +6,14 @@ from decimal import Decimal, localcontext
 from typing import Literal
 
 import equinox as eqx
+import jax.lax as lax
 import optimistix as optx
+from jaxtyping import Array
 
 from .._compositions import SOFRONIOU_SPALETTA, stages, SUZUKI_4
+from .._numbers import cast_to, State
 from .._system._bound import System
-from ._base import AbstractPresymplecticSolver, check_base, Scheme
+from ._base import AbstractPresymplecticSolver, check_base, Point, Scheme
 from ._engine import Stages
 from ._frozen import PresymplecticLeapfrog
 
@@ -74,7 +77,21 @@ class Composition(AbstractPresymplecticSolver):
         scheme = self.base.scheme(system)
         if len(set(self.weights)) > 1 and scheme.not_composable is not None:
             raise ValueError(scheme.not_composable)
-        return scheme._replace(moves=Stages([scheme.moves], stages(self.weights)))
+        parts, base = stages(self.weights), scheme.between
+
+        def each(system: System, t0: Array, start: Point, t: Array) -> State:
+            """A shorter step, of as many parts."""
+            assert base is not None
+
+            def part(y: State, x: Array) -> tuple[State, None]:
+                begin, end = (t0 + fraction * (t - t0) for fraction in x)
+                return base(system, begin, (y, start[1]), end), None
+
+            ends = cast_to(parts[:, :2], t)
+            return lax.scan(part, system.values(start[0]), ends)[0]
+
+        between = None if base is None else each
+        return scheme._replace(moves=Stages([scheme.moves], parts), between=between)
 
 
 def _leapfrog_if_none(base) -> AbstractPresymplecticSolver:

@@ -181,7 +181,11 @@ class Multistep(AbstractMove):
 def _known(data: _Data, span: Span, carry: _Carry) -> Array:
     """The number of steps in the history, -1 where it cannot start yet."""
     t0, t1, h = span
-    ulp = jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+    # Of the times of all steps so far, which were rounded where they are largest.
+    largest = jnp.maximum(
+        jnp.maximum(jnp.abs(t0), jnp.abs(t1)), jnp.abs(h) * carry.count
+    )
+    ulp = jnp.finfo(h.dtype).eps * largest
     change = jnp.abs(h - carry.h)
     same = (change <= 8 * ulp) & (change <= 1e-3 * jnp.abs(h))
     known = jnp.where(same, carry.count, 0)
