@@ -81,9 +81,9 @@ class Composition(AbstractPresymplecticSolver):
 
         def each(system: System, t0: Array, start: Point, t: Array) -> State:
             """A shorter step, of as many parts."""
-            assert base is not None
 
             def part(y: State, x: Array) -> tuple[State, None]:
+                assert base is not None
                 begin, end = (t0 + fraction * (t - t0) for fraction in x)
                 return base(system, begin, (y, start[1]), end), None
 
