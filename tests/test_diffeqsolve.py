@@ -401,14 +401,6 @@ def test_semi_implicit_euler_is_presymplectic_euler_without_damping():
 # Nested schemes
 
 
-@each(WAYS)
-def test_substeps_are_steps(scheme: Scheme):
-    times = jnp.array([1.0, 1.125, 1.25, 1.375, 1.5, 1.625, 1.75])
-    whole = march(TERM, dps.Substeps(scheme.solver, 3), times[::3], Y0)
-    parts = march(TERM, scheme.solver, times, Y0)
-    assert_close(whole, jtu.tree_map(lambda y: y[::3], parts), 1e-14)
-
-
 def test_compositions_nest():
     leapfrog = dps.PresymplecticLeapfrog()
     inner, outer = (0.7, -0.4, 0.7), (0.3, 0.4, 0.3)

@@ -14,6 +14,7 @@ import diffrax_presym as dps
 
 
 successful = dfx.RESULTS.successful
+UNIT_MASS = dps.QuadraticKinetic()
 END = dict(max_steps=20_000, throw=False)
 C = np.array([[0.5, 0.4], [0.1, 0.8]])
 Y0 = (jnp.array([1.0, -0.5]), jnp.array([0.2, 0.3]))
@@ -37,9 +38,7 @@ def by_matrix(t):
     ids=lambda x: type(x).__name__,
 )
 def test_matrix_friction_with_collocation(solver, adjoint):
-    system = dps.MechanicalSystem(
-        dps.QuadraticKinetic(), harmonic, friction=dps.ViscousDamping(jnp.asarray(C))
-    )
+    system = mechanical(dps.ViscousDamping(jnp.asarray(C)))
     options = {} if adjoint is None else {"adjoint": adjoint}
     sol = solve(system, solver, 0.0, 5.0, 0.2, Y0, **END, **options)
     assert np.max(np.abs(np.concatenate(last(sol)) - by_matrix(5.0))) < 1e-7
@@ -174,15 +173,26 @@ def test_a_step_that_is_too_large_is_a_failure(saveat):
     assert sol.result != successful
 
 
-def mechanical(friction, potential=harmonic, kinetic=None):
-    kinetic = dps.QuadraticKinetic() if kinetic is None else kinetic
+def pendulum(k):
+    return mechanical(None, lambda t, q, args: k * jnp.sum(1 - jnp.cos(q)))
+
+
+def slope(fn, x, h=1e-5):
+    return (fn(x + h) - fn(x - h)) / (2 * h)
+
+
+def solved(system, solver, t1=1.0, dt0=0.1, y0=Y0, **options):
+    options = {"adjoint": dps.FixedStepAdjoint(), "max_steps": 64} | options
+    return dfx.diffeqsolve(system, solver, 0.0, t1, dt0, y0, **options)
+
+
+def mechanical(friction, potential=harmonic, kinetic=UNIT_MASS):
     return dps.MechanicalSystem(kinetic, potential, friction)
 
 
 def exact(system, t0, t1, y0):
-    controller = dfx.PIDController(rtol=1e-12, atol=1e-12)
-    problem = system, dfx.Dopri8(), t0, t1, 0.01, y0
-    return solve(*problem, stepsize_controller=controller, max_steps=20_000)
+    options = {"stepsize_controller": dfx.PIDController(rtol=1e-12, atol=1e-12)}
+    return solve(system, dfx.Dopri8(), t0, t1, 0.01, y0, max_steps=20_000, **options)
 
 
 def distance(a, b):
@@ -193,25 +203,21 @@ def test_an_entry_without_friction_beside_one_with_a_singularity():
     system = mechanical(dps.LogDamping(jnp.array([3.0, 0.0])))
     y0 = jnp.ones(2), jnp.array([0.0, 1.0])
     q, p = last(solve(system, dps.TunedRKN6(), 0.0, 2.0, 0.1, y0))
-    assert abs(q[1] - (np.cos(2) + np.sin(2))) < 1e-10
-    assert abs(p[1] - (np.cos(2) - np.sin(2))) < 1e-10
+    assert distance((q[1], p[1]), np.cos(2) + np.array([1, -1]) * np.sin(2)) < 1e-10
 
 
 def test_equal_laws_of_both_energies_from_a_singularity():
     law, y0 = dps.LogDamping(3.0), (jnp.ones(2), jnp.zeros(2))
     general = dps.DissipativeHamiltonian(dps.QuadraticKinetic(), harmonic, law, law)
-    ends = [
-        last(solve(system, dps.TunedRKN6(), 0.0, 2.0, 0.1, y0))
-        for system in (general, mechanical(law))
-    ]
-    assert distance(*ends) < 1e-12
+    end = lambda x: last(solve(x, dps.TunedRKN6(), 0.0, 2.0, 0.1, y0))
+    assert distance(end(general), end(mechanical(law))) < 1e-12
 
 
-@pytest.mark.parametrize("delta", [1.0, 2.0])
-def test_powers_without_a_singularity(delta):
-    system = mechanical(dps.PowerDamping(0.3, delta))
-    end = last(solve(system, dps.TunedRKN6(), 0.0, 2.0, 0.1, Y0))
-    assert distance(end, last(exact(system, 0.0, 2.0, Y0))) < 1e-9
+def test_powers_without_a_singularity():
+    for delta in (1.0, 2.0):
+        system = mechanical(dps.PowerDamping(0.3, delta))
+        end = last(solve(system, dps.TunedRKN6(), 0.0, 2.0, 0.1, Y0))
+        assert distance(end, last(exact(system, 0.0, 2.0, Y0))) < 1e-9
 
 
 def test_friction_by_place_as_a_matrix_and_as_a_number():
@@ -249,11 +255,8 @@ def test_friction_by_place_that_amplifies_too_much():
 def test_the_energy_balance_over_long_times(times):
     system, ts = mechanical(dps.ConstantDamping(1e-3)), jnp.array(times)
     saveat = dfx.SaveAt(ts=ts)
-    ys = solve(
-        *(system, dps.TunedRKN6(), 0.0, 3000.0, 0.25, Y0),
-        **{"saveat": saveat, "adjoint": dps.FixedStepAdjoint(), "max_steps": None},
-    ).ys
-    error = dps.diagnostics.energy_error(system, ts, ys)
+    sol = solved(system, dps.TunedRKN6(), 3e3, 0.25, saveat=saveat, max_steps=None)
+    error = dps.diagnostics.energy_error(system, ts, sol.ys)
     assert error.shape == ts.shape
     assert np.max(np.abs(error)) < 1e-8
 
@@ -272,13 +275,12 @@ def test_momenta_of_velocities():
 def test_steps_for_a_fast_force_and_for_times_in_single_precision():
     fast = lambda t, q, args: jnp.sum(q**2) / 2 - 5 * jnp.sum(q) * jnp.cos(126 * t)
     system = mechanical(dps.ConstantDamping(0.1), fast)
-    options = dict(adjoint=dps.FixedStepAdjoint(), max_steps=None)
 
     def solve_by(dt0, dtype=float, saveat=None):
         saveat = dfx.SaveAt(t1=True) if saveat is None else saveat
         y0 = jax.tree.map(lambda x: x.astype(dtype), Y0)
-        problem = system, dps.TunedRKN6(), 0.0, 10.0, dt0, y0
-        return dfx.diffeqsolve(*problem, saveat=saveat, **options)
+        options = {"saveat": saveat, "max_steps": None}
+        return solved(system, dps.TunedRKN6(), 10.0, dt0, y0, **options)
 
     step = dps.choose_step(jax.jit(solve_by), 0.0, 10.0, rtol=1e-9, atol=1e-9)
     assert step.steps < 1000
@@ -293,25 +295,12 @@ def test_steps_for_a_fast_force_and_for_times_in_single_precision():
         dps.choose_step(batch, 0.0, 10.0, rtol=1e-3, atol=1e-3)
 
 
-def pendulum(k):
-    return mechanical(None, lambda t, q, args: k * jnp.sum(1 - jnp.cos(q)))
-
-
-def slope(fn, x, h=1e-5):
-    return (fn(x + h) - fn(x - h)) / (2 * h)
-
-
-def solved(system, solver, t1=1.0, dt0=0.1, y0=Y0, **options):
-    options = {"adjoint": dps.FixedStepAdjoint(), "max_steps": 64} | options
-    return dfx.diffeqsolve(system, solver, 0.0, t1, dt0, y0, **options).ys
-
-
 def test_gradients_of_a_force_that_ends_with_the_solve():
     def loss(k):
         force = dps.ForceField(lambda t, q, args: -k * q * jnp.sqrt(1 - t))
         saveat = dfx.SaveAt(ts=jnp.array([0.35, 1.0]))
         leapfrog = dps.PresymplecticLeapfrog()
-        return jnp.sum(solved(mechanical(None, force), leapfrog, saveat=saveat)[0])
+        return jnp.sum(solved(mechanical(None, force), leapfrog, saveat=saveat).ys[0])
 
     np.testing.assert_allclose(jax.grad(loss)(1.3), slope(loss, 1.3), 1e-7)
 
@@ -322,16 +311,16 @@ def test_gradients_of_rows_that_are_not_reached():
         fn = lambda t, y, args: jnp.linalg.norm(y[0] - q0)
         saveat = dfx.SaveAt(steps=True, fn=fn)
         y0, leapfrog = (q0, Y0[1]), dps.PresymplecticLeapfrog()
-        return jnp.sum(solved(pendulum(1.3), leapfrog, y0=y0, saveat=saveat)[:10])
+        sol = solved(pendulum(1.3), leapfrog, y0=y0, saveat=saveat)
+        return jnp.sum(sol.ys[:10])
 
     np.testing.assert_allclose(jax.grad(loss)(0.2), slope(loss, 0.2), 1e-7)
 
 
 def test_saved_times_within_several_steps_of_a_multistep_method():
     ts = jnp.array([3.0, 7.5, 14.0, 20.0])
-    solve_by = lambda solver, dt0: solved(
-        pendulum(1.0), solver, 20.0, dt0, saveat=dfx.SaveAt(ts=ts), max_steps=None
-    )
+    options = {"saveat": dfx.SaveAt(ts=ts), "max_steps": None}
+    solve_by = lambda *x: solved(pendulum(1.0), x[0], 20.0, x[1], **options).ys
     several = solve_by(dps.Substeps(dps.SymmetricMultistep(), 50), 5.0)
     assert distance(several, solve_by(dps.TunedRKN6(), 0.1)) < 1e-7
 
@@ -348,6 +337,5 @@ def test_a_multistep_method_with_given_times_across_zero():
 
 
 def test_a_scheme_is_compensated_once():
-    inner = dps.Substeps(dps.Compensated(dps.TunedRKN6()), 2)
     with pytest.raises(ValueError, match="Remove one"):
-        dps.Compensated(inner)
+        dps.Compensated(dps.Substeps(dps.Compensated(dps.TunedRKN6()), 2))

@@ -1,4 +1,4 @@
-"""`Compensated` and `Checked` around every scheme, and in any nesting."""
+"""`Compensated` around and within every scheme."""
 
 import diffrax as dfx
 import jax
@@ -44,20 +44,10 @@ def one_step(solver, hamiltonian: dps.extend.AbstractSystem = DAMPED):
     return step(hamiltonian, solver, T0, T1, Y0)[0]
 
 
-@pytest.mark.parametrize("wrap", [dps.Compensated], ids=["compensated"])
 @each()
-def test_a_wrapped_step_is_the_step(scheme: Scheme, wrap):
+def test_a_compensated_step_is_the_step(scheme: Scheme):
     expected = one_step(scheme.solver)
-    assert_close(one_step(wrap(scheme.solver)), expected, 1e-15)
-
-
-@pytest.mark.parametrize("kind", ["tao_fixed", "leapfrog_AB", "strang"])
-def test_any_nesting_of_wrappers(kind):
-    (scheme,) = (scheme for scheme in SCHEMES if scheme.name == kind)
-    expected = one_step(scheme.solver)
-    nested = dps.Substeps(dps.Compensated(scheme.solver), 1)
-    for solver in (nested, dps.Compensated(dps.Substeps(scheme.solver, 1))):
-        assert_close(one_step(solver), expected, 1e-15)
+    assert_close(one_step(dps.Compensated(scheme.solver)), expected, 1e-15)
 
 
 @each([s for s in SCHEMES if s.kind in ANY] + IMPLICIT)
@@ -68,17 +58,16 @@ def test_wrappers_of_schemes_for_any_energy(scheme: Scheme):
     assert_close(one_step(wrapped, NONSEPARABLE), expected, tolerance)
 
 
-@pytest.mark.parametrize("wrap", [dps.Compensated], ids=["compensated"])
 @pytest.mark.parametrize(
     "compose",
     [dps.Suzuki4, lambda base: dps.Substeps(base, 3)],
     ids=["composition", "substeps"],
 )
-def test_wrappers_inside_compositions(wrap, compose):
+def test_compensation_inside_compositions_and_around_them(compose):
     for base in (dps.PresymplecticLeapfrog(), dps.PresymplecticTao(5.0)):
-        expected = one_step(compose(base))
-        assert_close(one_step(compose(wrap(base))), expected, 1e-15)
-        assert_close(one_step(wrap(compose(base))), expected, 1e-15)
+        expected, inner = one_step(compose(base)), dps.Compensated(base)
+        for solver in (compose(inner), dps.Compensated(compose(base))):
+            assert_close(one_step(solver), expected, 1e-15)
 
 
 def test_gradients_where_the_solver_state_has_sums():
@@ -103,9 +92,6 @@ def test_wrappers_keep_what_the_scheme_has(wrap):
     assert not euler.is_symmetric
     assert wrap(dps.PresymplecticLeapfrog()).is_symmetric
     assert wrap(dps.TunedRKN6()).order(None) == 6
-    with pytest.raises(ValueError, match="only for a quadratic kinetic energy"):
-        quartic = dps.MechanicalSystem(lambda t, p, args: jnp.sum(p**4), henon_heiles)
-        one_step(wrap(dps.TunedRKN6()), quartic)
 
 
 @pytest.mark.parametrize(
@@ -130,10 +116,9 @@ def test_compensation_saves_digits(solver):
         assert sol.ys is not None
         return np.concatenate([np.asarray(y[-1], np.float64) for y in sol.ys])
 
-    solver32 = solver64 = solver
-    exact = end(solver64, jnp.float64)
-    plain = np.max(np.abs(end(solver32, jnp.float32) - exact))
-    compensated = end(dps.Compensated(solver32), jnp.float32)
+    exact = end(solver, jnp.float64)
+    plain = np.max(np.abs(end(solver, jnp.float32) - exact))
+    compensated = end(dps.Compensated(solver), jnp.float32)
     assert np.max(np.abs(compensated - exact)) < plain / 3
 
 
@@ -156,10 +141,3 @@ def test_steps_of_nominal_length_inside_others(wrap):
     assert sol.ys is not None
     end = np.array([y[-1, 0] for y in sol.ys])
     np.testing.assert_allclose(end, [np.cos(steps * h), -np.sin(steps * h)], atol=2e-4)
-
-
-def test_checked_fails_where_the_state_is_not_finite():
-    blow = dps.MechanicalSystem(dps.QuadraticKinetic(), lambda t, q, a: jnp.sum(q**8))
-    solver = dps.Suzuki4(dps.PresymplecticLeapfrog())
-    sol = solve(blow, solver, 0.0, 10.0, 2.0, (1e2 * Y0[0], Y0[1]), throw=False)
-    assert sol.result != dfx.RESULTS.successful
