@@ -189,8 +189,8 @@ MUTANTS = [
     Mutant(
         "a saved row is shifted by one",
         "_loop/_run.py",
-        "stop = jnp.where(reached, rows.stop, 0)",
-        "stop = jnp.where(reached, rows.stop - 1, 0)",
+        "stop = jnp.where(some, rows.stop[row], 0)",
+        "stop = jnp.where(some, rows.stop[row] - 1, 0)",
         ("times",),
     ),
     Mutant(
