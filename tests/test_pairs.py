@@ -197,7 +197,7 @@ def check_order(run: Run, claimed: float, rounding: float):
     x, y = np.log(last), np.log([errors[n] for n in last])
     slopes = -np.diff(y) / np.diff(x)
     order = max(-np.polyfit(x, y, 1)[0], np.min(slopes))
-    allowed = 0.4 if claimed < 6 else 0.6 if claimed < 8 else 1.2
+    allowed = 0.4 if claimed < 6 else 0.5 if claimed < 8 else 1.2
     assert order > claimed - allowed, f"order {order:.2f}, {errors}"
 
 

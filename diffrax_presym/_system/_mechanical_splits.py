@@ -91,13 +91,15 @@ class LocalSplit(AbstractSplit):
         def pushed(dp: PyTree, h: Time) -> PyTree:
             if friction is None:
                 return tree.add(dp, h, force)
-            data = friction.prepare(t, h, order)
-            gained = friction.decay(data, tree.sum(p, dp))
             # As in drifts, a stage back in time must not amplify rounding too much.
+            # Of a matrix nothing is known here but the time.
             most, back = 1 / math.sqrt(friction.precision), as_time(h) < 0
-            lost = back & (friction.amplification(t, -as_time(h)) > most)
-            new = tree.sum(dp, tree.sum(gained, friction.respond(data, force)))
-            return jtu.tree_map(lambda x: jnp.where(lost, jnp.nan, x), new)
+            data = jtu.tree_map(
+                lambda x: jnp.where(back & (x > most), jnp.nan, x),
+                friction.prepare(t, h, order),
+            )
+            gained = friction.decay(data, tree.sum(p, dp))
+            return tree.sum(dp, tree.sum(gained, friction.respond(data, force)))
 
         def slowed(drags: list[Drag], dp: PyTree, h: Time) -> PyTree:
             for drag in drags:
