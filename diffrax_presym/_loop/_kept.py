@@ -88,7 +88,8 @@ def _by_reversal(adjoint: Any, backward: Backward, places: Array) -> Position:
         known = jtu.tree_map(lambda x: x[j], trace.kept)
         at = backward.back_to(at, pulls, places[j], lambda n: None)
         miss = size(tree.sub(at.point[0], known[0]))
-        miss = miss / jnp.maximum(size(known[0]), size(end))
+        largest = jnp.maximum(size(known[0]), size(end))
+        miss = miss / jnp.where(largest > 0, largest, 1)  # at rest at the origin
         at = eqx.tree_at(lambda at: at.point, at, known)
         return at, jnp.maximum(worst, miss), j
 
