@@ -43,9 +43,6 @@ SCHEMES = {
     # Of order 8 for an oscillator, and 4 for other forces.
     "TunedLinear8": Scheme(dps.TunedLinear8(), 4, 14),
     # One evaluation per step, but 19 in each of the first `order - 1` steps.
-    "SymmetricMultistep(8)": Scheme(dps.SymmetricMultistep(8), 8, 1),
-    "SymmetricMultistep(10)": Scheme(dps.SymmetricMultistep(10), 10, 1),
-    "SymmetricMultistep(12)": Scheme(dps.SymmetricMultistep(12), 12, 1),
     "SofroniouSpaletta(10)": Scheme(dps.SofroniouSpaletta(10), 10, 35),
     "PresymplecticTao": Scheme(dps.PresymplecticTao(), 2, 3),
     # Six stages at once, in each of several iterations.

@@ -26,7 +26,7 @@ import diffrax_presym as dps
 
 TARGET = 1e-9
 HEYOKA = [10 ** (-8 - k / 2) for k in range(13)]  # tolerances
-CANDIDATES = ("TunedRKN6", "BlanesCasasRKN8", "BlanesMoanRKN6", "SymmetricMultistep(8)")
+CANDIDATES = ("TunedRKN6", "BlanesCasasRKN8", "BlanesMoanRKN6")
 
 
 def force_loop(problem, stages):

@@ -47,9 +47,6 @@ IMPLICIT = {
     "Gauss, 6 stages": Scheme(dps.PresymplecticGauss(6), 12, 40),
     # Its iteration ends at a tolerance.
     "Gauss, 4 stages, 1e-8": Scheme(dps.PresymplecticGauss(4, tolerance=1e-8), 8, 20),
-    # The schemes of the paper, which are explicit if the energy separates.
-    "Euler": Scheme(dps.PresymplecticEuler(root_finder=NEWTON), 1, 20),
-    "Leapfrog": Scheme(dps.PresymplecticLeapfrog(root_finder=NEWTON), 2, 40),
 }
 ANY = COPIES | IMPLICIT
 

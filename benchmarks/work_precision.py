@@ -50,7 +50,6 @@ OURS = [
     *("PresymplecticLeapfrog", "Suzuki4", "SofroniouSpaletta(8)"),
     *("BlanesMoan4", "BlanesMoan6", "BlanesMoanRKN4", "BlanesMoanRKN6"),
     *("BlanesCasasRKN8", "TunedRKN6", "TunedLinear8"),
-    *(f"SymmetricMultistep({order})" for order in (8, 10, 12)),
 ]
 # For energies that are not separable; Gauss to rounding, and to two tolerances.
 OTHERS = {
@@ -159,13 +158,13 @@ def all_runs(problem, quick, ts=None):
 
 def evaluations(t1, ts, key, found):
     """Of the force in a solve. Each saved time within a step costs as much as a step,
-    except with Gauss collocation, the multistep method and the solvers of Diffrax."""
+    except with Gauss collocation and the solvers of Diffrax."""
     (group, name), steps = key, found[1]
     known = {"SemiImplicitEuler": 1, "heyoka": math.nan}
     known |= {x: scheme.evaluations for x, scheme in (SCHEMES | DIFFRAX).items()}
     known |= {x: scheme.evaluations for x, scheme in OTHERS.items()}
     cost = known[name if name in known else name.split(",")[0]]
-    free = group != "ours" or "Gauss" in name or "Multistep" in name
+    free = group != "ours" or "Gauss" in name
     if ts is None or free:
         return cost * steps
     at = ts / t1 * steps

@@ -30,10 +30,8 @@ from ._scheme import (
     Splitting as Splitting,
     SplittingTableau as SplittingTableau,
     Strang as Strang,
-    Substeps as Substeps,
     Suzuki4 as Suzuki4,
     SuzukiYoshida as SuzukiYoshida,
-    SymmetricMultistep as SymmetricMultistep,
     TunedLinear8 as TunedLinear8,
     TunedRKN6 as TunedRKN6,
 )

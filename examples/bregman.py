@@ -72,7 +72,7 @@ def solve(objective, scaling, solver, q0, ts, substeps):
     hamiltonian = dps.BregmanHamiltonian(dps.EuclideanMirror(), objective, scaling)
     sol = dfx.diffeqsolve(
         hamiltonian,
-        dps.Substeps(solver, substeps),
+        dps.Composition(solver, (1 / substeps,) * substeps),
         t0=ts[0],
         t1=ts[-1],
         dt0=None,

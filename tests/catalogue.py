@@ -20,6 +20,7 @@ import lineax as lx
 import numpy as np
 import optimistix as optx
 import scipy.integrate
+from helpers import substeps
 from jax.flatten_util import ravel_pytree
 
 import diffrax_presym as dps
@@ -711,23 +712,10 @@ SCHEMES = [
         symmetric=False,
         composable=False,
     ),
-    Scheme(
-        *("Euler, implicit", lambda find: dps.PresymplecticEuler("momentum", find)),
-        *(1, None),
-        symmetric=False,
-        composable=False,
-        implicit=True,
-    ),
     Scheme("leapfrog", dps.PresymplecticLeapfrog, 2, "separable"),
     Scheme(
         *("leapfrog, position first", lambda: dps.PresymplecticLeapfrog("position")),
         *(2, "separable"),
-    ),
-    Scheme(
-        "leapfrog, implicit",
-        lambda find: dps.PresymplecticLeapfrog("position", find),
-        *(2, None),
-        implicit=True,
     ),
     Scheme("Yoshida4", dps.PresymplecticYoshida4, 4, "separable", inside=False),
     Scheme(
@@ -751,14 +739,6 @@ SCHEMES = [
     Scheme("TunedRKN6", dps.TunedRKN6, 6, "nystrom"),
     Scheme("RKN8", dps.BlanesCasasRKN8, 8, "nystrom"),
     Scheme("TunedLinear8", dps.TunedLinear8, 8, "shared", inside=False),
-    Scheme(
-        *("multistep 8", lambda: dps.SymmetricMultistep(8), 8, "shared"),
-        composable=False,
-    ),
-    Scheme(
-        *("multistep 12", lambda: dps.SymmetricMultistep(12), 12, "shared"),
-        composable=False,
-    ),
     Scheme(
         *("Tao", dps.PresymplecticTao, 2, None),
         composable=False,
@@ -805,13 +785,13 @@ def _composition(base):
 WRAPPERS = [
     Wrapper("bare", lambda base: base),
     Wrapper("Compensated", dps.Compensated),
-    Wrapper("Substeps", lambda base: dps.Substeps(base, 2), 2),
+    Wrapper("substeps", lambda base: substeps(base, 2), 2),
     Wrapper(
-        *("Substeps(Compensated)", lambda base: dps.Substeps(dps.Compensated(base), 3)),
+        *("substeps(Compensated)", lambda base: substeps(dps.Compensated(base), 3)),
         steps=3,
     ),
     Wrapper(
-        *("Compensated(Substeps)", lambda base: dps.Compensated(dps.Substeps(base, 2))),
+        *("Compensated(substeps)", lambda base: dps.Compensated(substeps(base, 2))),
         steps=2,
     ),
     Wrapper("Suzuki4", dps.Suzuki4, None, lambda order: 4, composes=True),

@@ -282,9 +282,9 @@ MUTANTS = [
     # What is refused.
     Mutant(
         "Nystrom splittings take friction by place",
-        "_system/_mechanical_splits.py",
-        'default=frozenset({"any"}))',
-        'default=frozenset({"any", "nystrom"}))',
+        "_system/_mechanical.py",
+        'KineticSplit(frozenset({"any"}))',
+        'KineticSplit(frozenset({"any", "nystrom"}))',
     ),
 ]
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, harmonic, solve, trajectory
+from helpers import assert_close, harmonic, solve, substeps, trajectory
 
 import diffrax_presym as dps
 
@@ -66,7 +66,7 @@ def test_no_drift_in_1e5_steps():
     # The step is a power of two, so times are exact. The error is bounded by that of
     # the scheme throughout; rounding errors are far smaller.
     system = conservative(harmonic)
-    solver = dps.Substeps(LEAPFROG, 50)
+    solver = substeps(LEAPFROG, 50)
     _, q, p = trajectory(system, solver, 0.0, 12500.0, 6.25, REST)
     error = np.abs((q**2 + p**2) / 2 - 0.5)
     assert error.max() < 0.125**2 / 4

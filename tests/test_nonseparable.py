@@ -104,7 +104,6 @@ ENTROPIC = dps.BregmanHamiltonian(dps.EntropyMirror(), cost, dps.PolynomialScali
 ANY = {
     "tao": dps.PresymplecticTao(),
     "midpoint": dps.PresymplecticGauss(1, FINDER),
-    "leapfrog": dps.PresymplecticLeapfrog("momentum", FINDER),
 }
 
 

@@ -176,15 +176,14 @@ def check_order(run: Run, claimed: float, rounding: float):
     """The slope over the three smallest steps with errors above rounding."""
     solve, errors = run.compiled, {}
     numbers = [8, 12, 16] if run.way.prescribed else NUMBERS
-    least = 24 if run.row["scheme"].name.startswith("multistep") else 4
     for n in numbers:
-        saved, result = solve(max(n, least), run.system, run.y0)
+        saved, result = solve(n, run.system, run.y0)
         if not successful(result):
             continue
         error = run.error(saved)
         if error < 5 * rounding and errors:
             break
-        errors[max(n, least)] = error
+        errors[n] = error
     assert errors, "no solve was successful"
     assert min(errors.values()) < 0.1
     # The errors of Tao's copies oscillate.
@@ -224,7 +223,6 @@ def last(ys):
 def check_gradient(run: Run, tolerance: float):
     """A derivative along a direction, of all that is saved and all that is a number."""
     rng, n = np.random.default_rng(1), 8 if run.way.prescribed else 12.0
-    n = 48.0 if run.row["scheme"].name.startswith("multistep") and n == 12.0 else n
     inputs, static = eqx.partition((run.system, run.y0), eqx.is_inexact_array)
     singular = run.row["friction"].limit is not None
 
@@ -277,8 +275,6 @@ def check(row: dict):
     combined = [row[k] for k in ("system", "friction", "scheme", "wrapper")]
     claimed = claim(*combined)
     assert not isinstance(claimed, Refused)
-    if way.name == "unequal steps" and scheme.name.startswith("multistep"):
-        claimed = min(claimed, 8)  # all steps are those of the start
     if way.name not in LATE and friction.limit is not None:
         claimed = min(claimed, 1)  # within the first step after a singular start
     run = Run(row, row["gradient"].adjoint(), "float64")

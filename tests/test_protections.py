@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, henon_heiles, oscillator, solve, step
+from helpers import assert_close, henon_heiles, oscillator, solve, step, substeps
 
 import diffrax_presym as dps
 
@@ -62,9 +62,9 @@ def test_compensated_error_grows_less():
     rms = {}
     exact = None
     for name, dtype, solver in (
-        ("exact", jnp.float64, dps.Substeps(BASES[1], 64)),
-        ("plain", jnp.float32, dps.Substeps(BASES[1], 64)),
-        ("kept", jnp.float32, dps.Compensated(dps.Substeps(BASES[1], 64))),
+        ("exact", jnp.float64, substeps(BASES[1], 64)),
+        ("plain", jnp.float32, substeps(BASES[1], 64)),
+        ("kept", jnp.float32, dps.Compensated(substeps(BASES[1], 64))),
     ):
         q = q0.astype(jnp.float32).astype(dtype)
         t0, t1, dt0 = (jnp.asarray(t, dtype) for t in (0.0, 3744.0, 8.0))
@@ -94,7 +94,7 @@ def test_substeps_divide_the_jitter_of_the_clock():
     t0, dt0 = jnp.float32(1e4), jnp.float32(0.01)
     for n, error in ((1, (0.02, 0.1)), (100, (0.0, 1e-3))):
         t1 = t0 + n * dt0
-        q = step(free, dps.Substeps(BASES[1], n), t0, t1, y0)[0][0]
+        q = step(free, substeps(BASES[1], n), t0, t1, y0)[0][0]
         assert error[0] <= abs(q / (n * dt0) - 1) <= error[1]
 
 

@@ -19,6 +19,7 @@ from helpers import (
     SCHEMES,
     solve,
     step,
+    substeps,
 )
 
 import diffrax_presym as dps
@@ -34,7 +35,7 @@ NONSEPARABLE = dps.ConformalHamiltonian(
 T0, T1 = 0.5, 0.6
 WRAPPERS = {
     "compensated": dps.Compensated,
-    "substeps": lambda solver: dps.Substeps(solver, 2),
+    "substeps": lambda solver: substeps(solver, 2),
 }
 wrappers = pytest.mark.parametrize("wrap", WRAPPERS.values(), ids=WRAPPERS)
 _finder = optx.Newton(rtol=1e-12, atol=1e-12)
@@ -60,7 +61,7 @@ def test_wrappers_of_schemes_for_any_energy(scheme: Scheme):
 
 @pytest.mark.parametrize(
     "compose",
-    [dps.Suzuki4, lambda base: dps.Substeps(base, 3)],
+    [dps.Suzuki4, lambda base: substeps(base, 3)],
     ids=["composition", "substeps"],
 )
 def test_compensation_inside_compositions_and_around_them(compose):
@@ -98,7 +99,7 @@ def test_wrappers_keep_what_the_scheme_has(wrap):
     "solver",
     [
         dps.PresymplecticLeapfrog(),
-        dps.Substeps(dps.Strang(), 2),
+        substeps(dps.Strang(), 2),
         pytest.param(dps.PresymplecticTao(5.0), marks=pytest.mark.slow),
     ],
     ids=lambda solver: type(solver).__name__,
@@ -126,7 +127,7 @@ def test_compensation_saves_digits(solver):
     "wrap",
     [
         dps.Suzuki4,
-        lambda base: dps.Substeps(base, 2),
+        lambda base: substeps(base, 2),
         dfx.HalfSolver,
     ],
     ids=["composition", "substeps", "half steps"],

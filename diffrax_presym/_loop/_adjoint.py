@@ -24,9 +24,8 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     r"""The loop for steps that are known beforehand, and exact gradients in it: the
     recommended way to solve, with or without gradients.
 
-    Saved times cost little, and between steps the solution has the full order of the
-    scheme: it is a shorter step of the scheme itself. A solve whose final or saved
-    states are not finite fails.
+    Between steps the solution is a shorter step of the scheme, of its full order. A
+    solve whose final or saved states are not finite fails.
 
     For every solver of this package, with `diffrax.ConstantStepSize`,
     [`diffrax_presym.StepsBetween`][] or `diffrax.StepTo`, and any `SaveAt` but dense

@@ -102,16 +102,6 @@ def _by_reversal(adjoint: Any, backward: Backward, places: Array) -> Position:
         at = lax.cond((places[0] > 0) & (at.n > 0), redo, lambda at: at, at)
         at = backward.back_to(at, pulls, jnp.asarray(0), lambda n: None)
     at = backward.start(at)
-    undoable = backward.scheme.undoable
-    if undoable is not None:
-        at = eqx.error_if(
-            at,
-            ~undoable(problem.start[1], trace.end[1]),
-            "`FixedStepAdjoint` cannot undo this solve: its steps change in "
-            "length, or its friction abruptly, and there a multistep method starts "
-            "again without its history. Use steps of one length, or "
-            '`FixedStepAdjoint("checkpoints")`.',
-        )
     # A solve that diverged has a gradient of NaN anyway.
     missed = ~(miss <= limit(adjoint, at.point[0])[0]) & tree.all_finite(trace.end[0])
     return eqx.error_if(

@@ -4,7 +4,6 @@ from ._composition import (
     Composition as Composition,
     PresymplecticYoshida4 as PresymplecticYoshida4,
     SofroniouSpaletta as SofroniouSpaletta,
-    Substeps as Substeps,
     Suzuki4 as Suzuki4,
     SuzukiYoshida as SuzukiYoshida,
 )
@@ -13,7 +12,6 @@ from ._frozen import (
     PresymplecticLeapfrog as PresymplecticLeapfrog,
 )
 from ._gauss import PresymplecticGauss as PresymplecticGauss
-from ._multistep import SymmetricMultistep as SymmetricMultistep
 from ._splitting import (
     BlanesCasasRKN8 as BlanesCasasRKN8,
     BlanesMoan4 as BlanesMoan4,

@@ -35,13 +35,8 @@ class Scheme(NamedTuple):
     start: Callable[[System, Array, State], PyTree] = _nothing
     # From the solver state the force that ends a step, if it is known.
     end_force: Callable[[PyTree], PyTree | None] = lambda carry: None
-    # The state at a time within a step, of the system, the start of the step and the
-    # time; a shorter step if `None`.
-    between: "Callable[[System, Array, Point, Array], State] | None" = None
-    # Whether a step can be inverted from its end; and of the solver states at the start
-    # and at the end of a solve, whether its steps can. `None` if always.
+    # Whether a step can be inverted from its end.
     is_invertible: bool = True
-    undoable: Callable[[PyTree, PyTree], Array] | None = None
     # Whether a step solves equations by iteration.
     is_implicit: bool = False
     # Why steps of unequal length must not be composed: these cancel errors only if the
@@ -124,17 +119,8 @@ def advance(
     return end, first_failure(result, system.check(span.t1, system.values(end[0])))
 
 
-def between(
-    scheme: Scheme,
-    system: System,
-    t0: Array,
-    start: Point,
-    t: Array,
-) -> State:
-    """The state at `t` within a step from `t0`, in full order: a shorter step of the
-    scheme from the start of the step, or what the scheme has in its place."""
-    if scheme.between is not None:
-        return scheme.between(system, t0, start, t)
+def between(scheme: Scheme, system: System, t0: Array, start: Point, t: Array) -> State:
+    """The state at `t` within a step from `t0`, in full order: a shorter step."""
     span = Span(t0, t, t - t0)
     return advance(scheme, system, span, start)[0][0]
 

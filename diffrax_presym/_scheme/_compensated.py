@@ -5,7 +5,7 @@ from .. import _tree as tree
 from .._numbers import State
 from .._system._base import AbstractSystem
 from .._system._bound import System
-from ._base import AbstractPresymplecticSolver, check_base, Point, Scheme
+from ._base import AbstractPresymplecticSolver, check_base, Scheme
 from ._engine import inverse, Stages
 from ._moves import ToSums
 
@@ -79,19 +79,8 @@ class Compensated(AbstractPresymplecticSolver):
             lost = tree.zeros(y)
             return base.start(system, t, jtu.tree_map(tree.Sum, y, lost)), lost
 
-        def between(system: System, t0: Array, start: Point, t: Array) -> State:
-            assert base.between is not None
-            y, (carry, _) = start
-            return base.between(system, t0, (y, carry), t)
-
-        def undoable(start: PyTree, end: PyTree) -> Array:
-            assert base.undoable is not None
-            return base.undoable(start[0], end[0])
-
         return base._replace(
             moves=Stages(moves, [(0, 0, 0), (0, 1, 1), (1, 1, 0)]),
             start=start,
             end_force=lambda carry: base.end_force(carry[0]),
-            between=None if base.between is None else between,
-            undoable=None if base.undoable is None else undoable,
         )

@@ -6,14 +6,10 @@ from decimal import Decimal, localcontext
 from typing import Literal
 
 import equinox as eqx
-import jax.lax as lax
-import optimistix as optx
-from jaxtyping import Array
 
 from .._compositions import SOFRONIOU_SPALETTA, stages, SUZUKI_4
-from .._numbers import cast_to, State
 from .._system._bound import System
-from ._base import AbstractPresymplecticSolver, check_base, Point, Scheme
+from ._base import AbstractPresymplecticSolver, check_base, Scheme
 from ._engine import Stages
 from ._frozen import PresymplecticLeapfrog
 
@@ -77,21 +73,7 @@ class Composition(AbstractPresymplecticSolver):
         scheme = self.base.scheme(system)
         if len(set(self.weights)) > 1 and scheme.not_composable is not None:
             raise ValueError(scheme.not_composable)
-        parts, base = stages(self.weights), scheme.between
-
-        def each(system: System, t0: Array, start: Point, t: Array) -> State:
-            """A shorter step, of as many parts."""
-
-            def part(y: State, x: Array) -> tuple[State, None]:
-                assert base is not None
-                begin, end = (t0 + fraction * (t - t0) for fraction in x)
-                return base(system, begin, (y, start[1]), end), None
-
-            ends = cast_to(parts[:, :2], t)
-            return lax.scan(part, system.values(start[0]), ends)[0]
-
-        between = None if base is None else each
-        return scheme._replace(moves=Stages([scheme.moves], parts), between=between)
+        return scheme._replace(moves=Stages([scheme.moves], stages(self.weights)))
 
 
 def _leapfrog_if_none(base) -> AbstractPresymplecticSolver:
@@ -109,9 +91,8 @@ def SuzukiYoshida(
 
     The scheme of the paper. Its error constants are large, and its stages extend beyond
     both ends of the step, by up to 0.35, 0.65 and 0.92 of its length at orders 4, 6 and
-    8. A system that is singular at the initial time, such as with
-    [`diffrax_presym.LogDamping`][] without a shift, is then evaluated outside its
-    domain.
+    8: there must be a force and a friction there, unlike with
+    [`diffrax_presym.LogDamping`][] near its singularity.
 
     **Arguments:**
 
@@ -119,9 +100,7 @@ def SuzukiYoshida(
     - `base`: a symmetric presymplectic solver of second order. Defaults to
         [`diffrax_presym.PresymplecticLeapfrog`][].
 
-    **Returns:**
-
-    A [`diffrax_presym.Composition`][].
+    **Returns:** a [`diffrax_presym.Composition`][].
 
     **Raises:**
 
@@ -156,24 +135,17 @@ def SuzukiYoshida(
 
 def PresymplecticYoshida4(
     first: Literal["momentum", "position"] = "momentum",
-    root_finder: optx.AbstractRootFinder | None = None,
-    root_find_max_steps: int = 32,
 ) -> Composition:
     """The fourth-order method of Creutz and Gocksch, Forest and Ruth, Suzuki, Yoshida.
 
-    4th order and symmetric. Three force evaluations per step. Uses 3rd order Hermite
+    4th order and symmetric. Three force evaluations per step. Uses Hermite
     interpolation for dense/ts output, at the cost of another step.
 
-    The fourth-order scheme of the paper, the same as
-    [`diffrax_presym.SuzukiYoshida`][]`(4)`; see there for its limitations.
+    The fourth-order scheme of the paper, [`diffrax_presym.SuzukiYoshida`][]`(4)`.
 
-    **Arguments:**
+    **Arguments:** as [`diffrax_presym.PresymplecticLeapfrog`][].
 
-    As [`diffrax_presym.PresymplecticLeapfrog`][].
-
-    **Returns:**
-
-    A [`diffrax_presym.Composition`][].
+    **Returns:** a [`diffrax_presym.Composition`][].
 
     ??? cite "Reference"
 
@@ -187,8 +159,7 @@ def PresymplecticYoshida4(
             pages={105--117}, year={1990}}
         ```
     """
-    base = PresymplecticLeapfrog(first, root_finder, root_find_max_steps)
-    return SuzukiYoshida(4, base)
+    return SuzukiYoshida(4, PresymplecticLeapfrog(first))
 
 
 def Suzuki4(base: AbstractPresymplecticSolver | None = None) -> Composition:
@@ -208,9 +179,7 @@ def Suzuki4(base: AbstractPresymplecticSolver | None = None) -> Composition:
     - `base`: a symmetric presymplectic solver of second order. Defaults to
         [`diffrax_presym.PresymplecticLeapfrog`][].
 
-    **Returns:**
-
-    A [`diffrax_presym.Composition`][].
+    **Returns:** a [`diffrax_presym.Composition`][].
 
     **Raises:**
 
@@ -237,9 +206,7 @@ def SofroniouSpaletta(
     - `base`: a symmetric presymplectic solver of second order. Defaults to
         [`diffrax_presym.PresymplecticLeapfrog`][].
 
-    **Returns:**
-
-    A [`diffrax_presym.Composition`][].
+    **Returns:** a [`diffrax_presym.Composition`][].
 
     **Raises:**
 
@@ -261,38 +228,6 @@ def SofroniouSpaletta(
             "order 4 use `Suzuki4()`."
         )
     return Composition(_leapfrog_if_none(base), SOFRONIOU_SPALETTA[order], order)
-
-
-def Substeps(base: AbstractPresymplecticSolver, n: int) -> Composition:
-    """Several equal steps of a scheme as one step of the solve.
-
-    Order and accuracy at the ends of steps are those of the base; the cost per step is
-    `n` times its cost. Dense/ts output interpolates over all `n` steps at once, and is
-    less accurate.
-
-    What `diffeqsolve` does once per step (`SaveAt(ts=...)`, events, `SaveAt(steps=...)`
-    of every `n`-th step, progress meters) is done `n` times less often.
-
-    **Arguments:**
-
-    - `base`: any presymplectic solver.
-    - `n`: the number of steps of the base in one step, a positive integer. The `dt0` of
-        the solve is `n` times the step of the base.
-
-    **Returns:**
-
-    A [`diffrax_presym.Composition`][].
-
-    **Raises:**
-
-    `ValueError` if `n` is not a positive integer.
-    """
-    if not isinstance(n, int) or n < 1:
-        raise ValueError(
-            "`Substeps(base, n)` needs a positive Python integer `n`, for example "
-            f"`Substeps(PresymplecticLeapfrog(), 10)`, but got {n!r}."
-        )
-    return Composition(base, (1 / n,) * n)
 
 
 def triple_jump(order: int) -> tuple[float, ...]:

@@ -64,16 +64,17 @@ class AbstractMove(eqx.Module):
     """
 
     @abc.abstractmethod
-    def prepare(self, system: System, span: Span) -> PyTree:
-        """What the move needs of time alone; called under `jax.vmap`."""
-
-    @abc.abstractmethod
     def apply(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
         """The state at the end of the span, from that at its start."""
 
     @abc.abstractmethod
     def undo(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
         """The inverse: the state at the end of the reversed span."""
+
+    def prepare(self, system: System, span: Span) -> PyTree:
+        """What the move needs of time alone, by default nothing; called under
+        `jax.vmap`."""
+        return None
 
 
 class Inverse(AbstractMove):

@@ -28,7 +28,6 @@ from ._gauss_solve import (
     matrix_product,
     Slopes,
 )
-from ._moves import root_find
 
 
 class _Carry(NamedTuple):
@@ -114,8 +113,8 @@ class Collocation(AbstractMove):
             limits = self.max_iterations, self.tolerance
             find = lambda guess: fixed_point(step, guess, *limits)
             return implicit(step, find, guess, contract)
-        by_finder = root_find(self.root_finder, self.max_iterations)
-        find = lambda guess: by_root_finder(step, guess, by_finder)
+        how = self.root_finder, self.max_iterations
+        find = lambda guess: by_root_finder(step, guess, *how)
         return implicit(step, find, guess, factorise)
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
 import numpy as np
+import optimistix as optx
 from jaxtyping import Array, Inexact, PyTree, Shaped
 
 from .. import _tree as tree
@@ -17,7 +18,6 @@ from .._friction._linear import Effects
 from .._numbers import cast_to, State
 from .._system._bound import System
 from ._collocation import gauss_table, GaussTable
-from ._moves import RootFind
 
 
 # Velocities and forces of all stages, times weight and length of the step, the forces
@@ -196,12 +196,20 @@ def fixed_point(step: GaussStep, guess: Slopes, max_iterations: int, tolerance: 
     return search.slopes, results.where(converged, results.successful, failure)
 
 
-def by_root_finder(step: GaussStep, guess: Slopes, find: RootFind):
+def by_root_finder(
+    step: GaussStep,
+    guess: Slopes,
+    root_finder: optx.AbstractRootFinder,
+    max_steps: int,
+):
     # Extrapolation of stiff components may be inaccurate.
     sizes = (tree.largest(step.residual(x)) for x in (guess, tree.zeros(guess)))
     better = jnp.less(*sizes)
     guess = jtu.tree_map(lambda x: jnp.where(better, x, 0), guess)
-    return find(lambda slopes: step.slopes(step.stages(slopes)), guess)
+    residual = lambda slopes, _: step.residual(slopes)
+    options = {"max_steps": max_steps, "throw": False}
+    solution = optx.root_find(residual, root_finder, guess, **options)
+    return solution.value, dfx.RESULTS.promote(solution.result)
 
 
 def _lowest(x: PyTree):

@@ -4,11 +4,7 @@ The state within a step is a pair: `(q, p)`, and at the ends of a step the force
 if the scheme starts with a kick.
 """
 
-from collections.abc import Callable
-
-import diffrax as dfx
 import equinox as eqx
-import optimistix as optx
 from jaxtyping import PyTree
 
 from .. import _tree as tree
@@ -18,9 +14,6 @@ from ._engine import AbstractMove, Outcome, Span, Stage
 
 class Enter(AbstractMove):
     """From `(q, p)` to the variables of the shared split; the inverse goes back."""
-
-    def prepare(self, system: System, span: Span) -> None:
-        return None
 
     def apply(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
         y, carry = stage
@@ -60,9 +53,6 @@ class Kick(AbstractMove):
     order: int = eqx.field(static=True)
     known: bool = eqx.field(static=True, default=False)
 
-    def prepare(self, system: System, span: Span) -> None:
-        return None
-
     def apply(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
         if not self.known:
             return self.undo(system, span, data, stage)
@@ -76,65 +66,8 @@ class Kick(AbstractMove):
         return (y, force if self.known else carry), None
 
 
-# The moves of the paper, with forces and velocities frozen at one end. For nonseparable
-# energies either a move or its inverse is implicit.
-
-RootFind = Callable[[Callable, PyTree], tuple[PyTree, dfx.RESULTS]]
-
-
-def root_find(root_finder: optx.AbstractRootFinder | None, max_steps: int) -> RootFind:
-    """A root find for `x = fn(x)`, from a guess."""
-
-    def find(fn: Callable, guess: PyTree) -> tuple[PyTree, dfx.RESULTS]:
-        assert root_finder is not None  # the scheme has checked that there is one
-        solution = optx.root_find(
-            lambda x, _: tree.sub(fn(x), x),
-            root_finder,
-            guess,
-            max_steps=max_steps,
-            throw=False,
-        )
-        return solution.value, dfx.RESULTS.promote(solution.result)
-
-    return find
-
-
-class FrozenKick(AbstractMove):
-    """A kick by the force at `p` after it; the inverse is by that at `p` before it."""
-
-    root_finder: optx.AbstractRootFinder | None
-    max_steps: int = eqx.field(static=True)
-    known: bool = eqx.field(static=True, default=False)
-
-    def prepare(self, system: System, span: Span) -> None:
-        return None
-
-    def _by(self, force: PyTree, system: System, span: Span, stage: Stage) -> Outcome:
-        y, carry = stage
-        y = system.add(y, (None, tree.scale(span.h, force)))
-        return (y, None if carry is None else force), None
-
-    def apply(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
-        y, carry = stage
-        if self.known:
-            return self._by(carry, system, span, stage)
-        if system.is_separable:
-            return self._by(system.force(span.t0, y), system, span, stage)
-        after = lambda dp: system.add(y, (None, dp))
-        find = root_find(self.root_finder, self.max_steps)
-        kick = lambda dp: tree.scale(span.h, system.force(span.t0, after(dp)))
-        dp, result = find(kick, tree.zeros(y[1]))
-        return (after(dp), carry), result
-
-    def undo(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
-        return self._by(system.force(span.t0, stage[0]), system, span, stage)
-
-
 class FrozenDrift(AbstractMove):
     """A drift by the velocity at its start; the inverse is by that at its end."""
-
-    root_finder: optx.AbstractRootFinder | None
-    max_steps: int = eqx.field(static=True)
 
     def prepare(self, system: System, span: Span) -> PyTree:
         return system.prepare_decay(span.t0, span.h)
@@ -148,14 +81,8 @@ class FrozenDrift(AbstractMove):
     def undo(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
         y, carry = stage
         y = system.decay(data, y)
-        after = lambda dq: system.add(y, (dq, None))
-        drift = lambda dq: tree.scale(span.h, system.velocity(span.t1, after(dq)))
-        nothing = tree.zeros(y[0])
-        if system.is_separable:
-            return (after(drift(nothing)), carry), None
-        find = root_find(self.root_finder, self.max_steps)
-        dq, result = find(drift, nothing)
-        return (after(dq), carry), result
+        velocity = system.velocity(span.t1, y)
+        return (system.add(y, (tree.scale(span.h, velocity), None)), carry), None
 
 
 class ToSums(AbstractMove):
@@ -163,9 +90,6 @@ class ToSums(AbstractMove):
 
     The solver state is `(carry, rounding errors)` outside, and `carry` within.
     """
-
-    def prepare(self, system: System, span: Span) -> None:
-        return None
 
     def apply(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
         y, (carry, lost) = stage

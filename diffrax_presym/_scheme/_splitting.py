@@ -94,6 +94,15 @@ def find_split(
             "friction)` with such friction, or none. Otherwise use `TunedRKN6()`, "
             "`BlanesMoan6()` or `PresymplecticGauss()`."
         )
+    if kind == "separable":
+        explicit = "`Strang()` or `BlanesMoan4()`, which are explicit, or "
+        instead = "" if system.split("any") is None else explicit
+        raise ValueError(
+            f"This `{system.name}` is not separable, so `{name}` would be implicit. If "
+            "the energy is a sum T(t, p) + V(t, q), give its parts: "
+            "`MechanicalSystem(kinetic, potential)`. Otherwise use "
+            f"{instead}`PresymplecticGauss()`."
+        )
     if system.split("any") is None:
         raise ValueError(
             f"`{name}` needs a system split into a kinetic part and a potential, but "

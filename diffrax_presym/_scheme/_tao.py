@@ -30,9 +30,6 @@ class Exchange(AbstractMove):
     second: bool = eqx.field(static=True, default=False)
     known: bool = eqx.field(static=True, default=False)
 
-    def prepare(self, system: System, span: Span) -> None:
-        return None
-
     def apply(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
         if not self.known:
             # The map does not change the arguments of its field: it is its own inverse.

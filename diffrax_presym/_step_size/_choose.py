@@ -80,21 +80,19 @@ def choose_step(
     wrapper, `SaveAt`, arguments and events, of which times are compared too. Under
     `jax.jit` it is compiled once, for the choice and for its use.
 
-    The problem is solved with more and more steps, each time about twice as many. From
-    the differences, by Richardson extrapolation, follow the errors and the order. Once
-    three solves agree with an order and the tolerance is reached, a smaller number of
-    steps is searched, whose errors are measured against the finest solve. All of this
-    takes about as long as ten solves with the chosen step.
+    The problem is solved with more and more steps, each time about twice as many, until
+    three solves agree with an order, by Richardson extrapolation, and the tolerance is
+    reached. Then a smaller number of steps is searched, whose errors are measured
+    against the finest solve: about as long as ten solves with the chosen step.
 
-    The step divides the span. If the saved times are regular, on a grid that divides
-    the span, the step also divides the spacing of the grid or is a multiple of it,
-    unless this takes more than twice as many steps. As numbers of steps are then
-    multiples or divisors of that of the grid, the error may be much smaller than aimed
+    The step divides the span. If the saved times are on a grid that divides the span,
+    the step also divides the spacing of the grid or is a multiple of it, unless this
+    takes more than twice as many steps. The error may then be much smaller than aimed
     at.
 
     It needs concrete numbers, so it is called outside of `jax.jit`. It knows only the
-    solve that it is given: choose another step for another initial state or other
-    parameters, and in a batch that of its most difficult member.
+    solve that it is given: for other parameters choose another step, and in a batch
+    that of its most difficult member.
 
     !!! example
 

@@ -119,11 +119,6 @@ class System(eqx.Module):
         return next(splits, None)
 
     @property
-    def is_separable(self) -> bool:
-        """Whether the velocity depends on `p` alone, and the force on `q`."""
-        return self.split("separable") is not None
-
-    @property
     def prepares_once(self) -> bool:
         """Whether what is prepared for a drift depends on its length alone."""
         return self.term.drift_is_autonomous and (

@@ -18,7 +18,7 @@ from ._kinetic import (
     QuadraticKinetic,
     RelativisticKinetic,
 )
-from ._mechanical_splits import KineticSplit, LocalSplit, PotentialSplit, SharedSplit
+from ._mechanical_splits import KineticSplit, PotentialSplit, SharedSplit
 from ._potential import AbstractPotential, as_potential, QuadraticPotential
 from ._split import AbstractSplit
 
@@ -154,9 +154,11 @@ class MechanicalSystem(AbstractSystem):
         if self.external is not None:
             return ()
         if parts.local or parts.drags:
-            return (LocalSplit(),)
+            return (KineticSplit(frozenset({"any"})),)
         kinetic = self.kinetic
-        splits: list[AbstractSplit] = [KineticSplit(kinetic.is_quadratic)]
+        nystrom = {"nystrom"} if kinetic.is_quadratic else set()
+        kinds = frozenset({"separable", "any"} | nystrom)
+        splits: list[AbstractSplit] = [KineticSplit(kinds)]
         if isinstance(self.potential, QuadraticPotential):
             splits.append(PotentialSplit())
         smooth = all(part.log_scale.is_smooth for part in parts.linear)

@@ -28,55 +28,32 @@ def _potential_force(system: "System", t: Time, y: State) -> PyTree:
     return system.term.potential.force(t, tree.values(y)[0], system.args)
 
 
-def _flow(system: "System", t: Time, h: Time, data: PyTree, y: State) -> State:
-    """The flow of the kinetic energy and of linear friction."""
-    p = tree.values(y)[1]
-    flow = system.term.kinetic.flow(system.friction, t, h, data, p, system.args)
-    return system.add(y, flow)
-
-
 class KineticSplit(AbstractSplit):
-    """The drift is the flow of the kinetic energy, and the kick that of the
-    potential."""
+    """The drift is the flow of the kinetic energy and of linear friction, the kick that
+    of the potential and of friction that depends on place or speed: exact if that is
+    linear, otherwise a composition."""
 
     kinds: frozenset[str] = eqx.field(static=True)
 
-    def __init__(self, is_quadratic: bool):
-        nystrom = {"nystrom"} if is_quadratic else set()
-        self.kinds = frozenset({"separable", "any"} | nystrom)
-
     def prepare(self, system, t, h, order) -> PyTree:
         return system.term.kinetic.prepare(system.friction, t, h, order)
 
     def drift(self, system, t, h, data, y) -> State:
-        return _flow(system, t, h, data, y)
+        kinetic, p = system.term.kinetic, tree.values(y)[1]
+        return system.add(y, kinetic.flow(system.friction, t, h, data, p, system.args))
 
     def force(self, system, t, y) -> PyTree:
-        return _potential_force(system, t, y)
-
-
-class LocalSplit(AbstractSplit):
-    """The same with friction that depends on place or speed, which is part of the kick:
-    exact if it is linear, otherwise a composition."""
-
-    kinds: frozenset[str] = eqx.field(static=True, default=frozenset({"any"}))
-
-    def prepare(self, system, t, h, order) -> PyTree:
-        return system.term.kinetic.prepare(system.friction, t, h, order)
-
-    def drift(self, system, t, h, data, y) -> State:
-        return _flow(system, t, h, data, y)
-
-    def force(self, system, t, y) -> PyTree:
-        """The force, and the numbers of the friction at the place."""
+        """The force, and other friction at the place."""
         parts, at = system.term.parts, (t, tree.values(y)[0], system.args)
         forms = [part.at(*at) for part in parts.local]
         drags = [drag.at(*at) for drag in parts.drags]
-        numbers = [(drag.coefficient, drag.medium) for drag in drags]
-        return _potential_force(system, t, y), forms, numbers
+        force = _potential_force(system, t, y)
+        return (force, forms, drags) if forms or drags else force
 
     def kick(self, system, t, h, y, force, order) -> State:
-        (force, forms, numbers), p = force, tree.values(y)[1]
+        if "separable" in self.kinds:
+            return system.add(y, (None, tree.scale(h, force)))
+        (force, forms, drags), p = force, tree.values(y)[1]
         parts, mechanics = system.term.parts, system.term.mechanics
         pairs = zip(parts.local, forms, strict=True)
         linear = [
@@ -84,9 +61,6 @@ class LocalSplit(AbstractSplit):
             for part, x in pairs
         ]
         friction = fit_friction(linear, mechanics, p)
-        where = lambda drag: (drag.coefficient, drag.medium)
-        pairs = zip(parts.drags, numbers, strict=True)
-        drags = [eqx.tree_at(where, *pair, is_leaf=_is_none) for pair in pairs]
 
         def pushed(dp: PyTree, h: Time) -> PyTree:
             if friction is None:
@@ -115,9 +89,6 @@ class LocalSplit(AbstractSplit):
         else:
             dp = pushed(tree.zeros(p), h)
         return system.add(y, (None, dp))
-
-
-_is_none = lambda x: x is None
 
 
 class PotentialSplit(AbstractSplit):

@@ -22,7 +22,7 @@ system = dps.MechanicalSystem(
     lambda t, q, args: jnp.sum(q**4 / 4 - q**2 / 2 - 0.3 * q * jnp.cos(1.2 * t)),
     friction=dps.ConstantDamping(0.3),
 )
-solver, dt0 = dps.SymmetricMultistep(8), 0.07
+solver, dt0 = dps.TunedRKN6(), 0.23
 cuts = np.array([0.0, 14.3, 29.3])  # steps end there, in a whole solve too
 y0 = jnp.array([1.0]), jnp.array([0.0])
 
