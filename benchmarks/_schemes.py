@@ -40,9 +40,7 @@ SCHEMES = {
     "SuzukiYoshida(8)": Scheme(dps.SuzukiYoshida(8), 8, 27),
     "SofroniouSpaletta(8)": Scheme(dps.SofroniouSpaletta(8), 8, 21),
     "BlanesCasasRKN8": Scheme(dps.BlanesCasasRKN8(), 8, 19),
-    # Of order 8 for an oscillator, and 4 for other forces.
-    "TunedLinear8": Scheme(dps.TunedLinear8(), 4, 14),
-    # One evaluation per step, but 19 in each of the first `order - 1` steps.
+    "TunedLinear8": Scheme(dps.TunedLinear8(), 8, 14),
     "SofroniouSpaletta(10)": Scheme(dps.SofroniouSpaletta(10), 10, 35),
     "PresymplecticTao": Scheme(dps.PresymplecticTao(), 2, 3),
     # Six stages at once, in each of several iterations.

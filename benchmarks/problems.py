@@ -19,8 +19,6 @@ class Problem:
     q0: Any
     p0: Any
     t1: float
-    # Whether the force is linear in the positions.
-    linear: bool = False
     # The solution at `t1`, where it has a closed form.
     exact: Callable | None = None
     # About the shortest period over six, in which sweeps of steps and the steps of the
@@ -71,7 +69,6 @@ def decaying():
         "decaying oscillator",
         mechanics(dps.QuadraticPotential(), dps.LogDamping(gamma, 1.0)),
         *(np.array([1.0]), np.array([0.0]), 100.0),
-        linear=True,
     )
 
 
@@ -145,7 +142,6 @@ def random_quadratic(n=1000, m=1250):
         f"random quadratic, {n}",
         mechanics(potential, dps.ConstantDamping(gamma)),
         *(np.ones(n), np.zeros(n), t1),
-        linear=True,
         exact=exact,
     )
 

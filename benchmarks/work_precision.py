@@ -136,7 +136,7 @@ def all_runs(problem, quick, ts=None):
     separable = problem.system.splits != ()
     ours = {name: SCHEMES[name] for name in OURS} if separable else OTHERS
     for name, (solver, _, evaluations) in ours.items():
-        if (problem.linear or "Linear" not in name) and accepts(solver, problem):
+        if accepts(solver, problem):
             runs["ours", name] = run_of(solver), counts(evaluations)
     if problem.distances is not None:
         distances = problem.distances

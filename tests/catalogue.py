@@ -31,9 +31,9 @@ START, LENGTH = 0.25, 1.5
 
 # Systems. The numbers of NumPy are flat, in the order of `ravel_pytree`.
 
-ALL = frozenset({"separable", "any", "nystrom", "shared"})
 SPLIT = frozenset({"separable", "any"})
-SWAPPED = frozenset({"separable", "any", "nystrom"})
+ALL = SPLIT | {"nystrom"}
+LINEAR = ALL | {"shared"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -51,7 +51,6 @@ class System:
     takes: str
     mass: Any = None
     bodies: bool = False  # whether the last axis are the coordinates of bodies
-    linear: bool = False
     start: float = START
 
     def __repr__(self):
@@ -317,8 +316,7 @@ SYSTEMS = [
     ),
     System(
         *("linear", _mechanical(_quadratic(_MASS), dps.QuadraticPotential(_SPRINGS))),
-        *(_inverse(_MASS), _spring_force, *_TWO, ALL, "all", _MASS),
-        linear=True,
+        *(_inverse(_MASS), _spring_force, *_TWO, LINEAR, "all", _MASS),
     ),
     System(
         *("relativistic", _mechanical(dps.RelativisticKinetic(1.0, 2.0), _coupled)),
@@ -331,7 +329,7 @@ SYSTEMS = [
     System(
         "any T, springs",
         _mechanical(_smooth_kinetic, dps.QuadraticPotential(_SPRINGS)),
-        *(_smooth_velocity, _spring_force, *_TWO, SWAPPED, "rates"),
+        *(_smooth_velocity, _spring_force, *_TWO, ALL, "rates"),
     ),
     System(
         *("any energy", _energy(_mixed), _mixed_velocity, _mixed_force),
@@ -353,7 +351,7 @@ SYSTEMS = [
     ),
     System(
         *("dissipative", _one_law(_dissipative), _dissipative_velocity, _driven_force),
-        *(*_TWO, SWAPPED, "one rate"),
+        *(*_TWO, ALL, "one rate"),
     ),
     System(
         *("Bregman", _bregman(dps.EntropyMirror()), _entropy_velocity, _entropy_force),
@@ -363,7 +361,7 @@ SYSTEMS = [
     System(
         *("Bregman, Euclidean", _bregman(dps.EuclideanMirror())),
         lambda t, q, p, eta: 2 / t * p,
-        *(_euclidean_force, *_POSITIVE, SWAPPED, "none"),
+        *(_euclidean_force, *_POSITIVE, ALL, "none"),
         start=1.0,
     ),
     System(
@@ -389,7 +387,6 @@ class Friction:
     needs: str = ""  # "mass" or "bodies"
     double: bool = False  # whether it is made for double precision
     constant: bool = True  # in time
-    smooth: bool = True  # whether its rate has a derivative that is known
     # From rest at a singularity: the order that is left, and the limit of the force and
     # its friction, of the system and the force.
     left: Callable[[System], float] = lambda s: np.inf
@@ -563,13 +560,11 @@ FRICTION = [
         *("eta(t)", _same(_wave), _rate(lambda t: 0.1 + 0.2 * np.cos(t)), "one rate"),
         eta=lambda t: 0.1 * t + 0.2 * np.sin(t),
         constant=False,
-        smooth=False,
     ),
     Friction(
         *("rate that jumps", _same(_jump), _rate(lambda t: 0.5 * (t > _KINK))),
         *("one rate", lambda t: 0.5 * max(t - _KINK, 0)),
         constant=False,
-        smooth=False,
         kink=_KINK,
     ),
     _from_rest("3 / t", [dps.LogDamping(3.0)], 3.0),
@@ -738,7 +733,7 @@ SCHEMES = [
     Scheme("RKN6", dps.BlanesMoanRKN6, 6, "nystrom"),
     Scheme("TunedRKN6", dps.TunedRKN6, 6, "nystrom"),
     Scheme("RKN8", dps.BlanesCasasRKN8, 8, "nystrom"),
-    Scheme("TunedLinear8", dps.TunedLinear8, 8, "shared", inside=False),
+    Scheme("TunedLinear8", dps.TunedLinear8, 8, "shared"),
     Scheme(
         *("Tao", dps.PresymplecticTao, 2, None),
         composable=False,
@@ -843,8 +838,8 @@ def offered(system: System, friction: Friction) -> frozenset[str] | Refused:
         return frozenset()
     if kind in ("place", "drag"):
         return system.offers & {"any"}
-    smooth = friction.smooth and kind == "one rate"
-    return system.offers - (frozenset() if smooth else {"shared"})
+    constant = friction.constant and kind == "one rate"
+    return system.offers - (frozenset() if constant else {"shared"})
 
 
 def claim(
@@ -859,8 +854,6 @@ def claim(
     if wrapper.composes and not scheme.composable:
         return Refused("not a base of compositions")
     order = scheme.order
-    if scheme.name == "TunedLinear8" and not (system.linear and friction.constant):
-        order = 4
     if wrapper.composes and order == 2:
         order = wrapper.order(order)
     if friction.kind == "drag" and system.size == 1:

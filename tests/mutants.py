@@ -45,11 +45,10 @@ MUTANTS = [
         ("Gauss 4",),
     ),
     Mutant(
-        "a rate that jumps is accepted in the shared frame",
-        "_friction/_log_scale.py",
-        "# It may have a rate that jumps.\n    is_smooth: ClassVar[bool] = False",
-        "is_smooth: ClassVar[bool] = True",
-        ("rate that jumps",),
+        "a rate that varies is accepted in the shared frame",
+        "_system/_mechanical.py",
+        "constant = all(part.log_scale.is_autonomous for part in parts.linear)",
+        "constant = True",
     ),
     Mutant(
         "no closed form of the logarithm",

@@ -44,10 +44,17 @@ def test_matrix_friction_with_collocation(solver, adjoint):
     assert np.max(np.abs(np.concatenate(last(sol)) - by_matrix(5.0))) < 1e-7
 
 
-def test_a_rate_that_may_jump_where_it_must_be_smooth():
-    law = lambda t: 0.5 * jnp.maximum(t - 4.03, 0)
-    system = dps.ConformalHamiltonian(dps.QuadraticKinetic(), harmonic, law)
-    with pytest.raises(ValueError, match="may jump"):
+@pytest.mark.parametrize(
+    ("potential", "law"),
+    [
+        (dps.QuadraticPotential(), lambda t: 0.5 * jnp.maximum(t - 4.03, 0)),
+        (dps.QuadraticPotential(), dps.LogDamping(2.0, 1.0)),
+        (harmonic, dps.ConstantDamping(0.1)),
+    ],
+)
+def test_a_scheme_for_linear_systems_refuses_others(potential, law):
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), potential, law)
+    with pytest.raises(ValueError, match="only for a linear force"):
         solve(system, dps.TunedLinear8(), 0.0, 10.0, 0.1, Y0)
 
 

@@ -37,10 +37,8 @@ class AbstractLogScale(eqx.Module):
     instance as `friction=`; a function `eta(t)` is enough otherwise.
     """
 
-    # Whether the rate is constant; and whether it has a derivative, which schemes in
-    # the shared frame need.
+    # Whether the rate is constant.
     is_autonomous: eqx.AbstractClassVar[bool]
-    is_smooth: eqx.AbstractClassVar[bool]
 
     @abc.abstractmethod
     def __call__(self, t: Time) -> Inexact[Array, "..."]:
@@ -96,7 +94,6 @@ class Linear(AbstractLogScale):
     r"""$\eta(t) = t$."""
 
     is_autonomous: ClassVar[bool] = True
-    is_smooth: ClassVar[bool] = True
 
     def __call__(self, t: Time) -> Scalar:
         return as_time(t)
@@ -123,7 +120,6 @@ class Logarithm(AbstractLogScale):
 
     shift: Inexact[ArrayLike, "..."] | None
     is_autonomous: ClassVar[bool] = False
-    is_smooth: ClassVar[bool] = True
 
     def __call__(self, t: Time) -> Scalar:
         return jnp.log(self._after(t))
@@ -170,7 +166,6 @@ class Power(AbstractLogScale):
 
     delta: Inexact[ArrayLike, "..."]
     is_autonomous: ClassVar[bool] = False
-    is_smooth: ClassVar[bool] = True
 
     def _parameters(self, t: Time):
         """Whether time is zero, the time, or 1 there, and the exponent."""
@@ -202,8 +197,6 @@ class FunctionOfTime(AbstractLogScale):
 
     eta: Callable
     is_autonomous: ClassVar[bool] = False
-    # It may have a rate that jumps.
-    is_smooth: ClassVar[bool] = False
 
     def __call__(self, t: Time) -> Inexact[Array, "..."]:
         return cast_to(self.eta(t), as_time(t))

@@ -88,11 +88,10 @@ def find_split(
         return split
     if kind == "shared":
         raise ValueError(
-            f"`{name}` needs a known mass that does not depend on time, and one rate "
-            "of friction for all momenta, with a derivative: that of a function eta(t) "
-            "may jump. Write `MechanicalSystem(QuadraticKinetic(mass), potential, "
-            "friction)` with such friction, or none. Otherwise use `TunedRKN6()`, "
-            "`BlanesMoan6()` or `PresymplecticGauss()`."
+            f"`{name}` keeps its order only for a linear force and at most one rate of "
+            "constant friction. Write `MechanicalSystem(QuadraticKinetic(mass), "
+            "QuadraticPotential(stiffness), ConstantDamping(rate))`; otherwise use "
+            "`TunedRKN6()`, `BlanesMoan6()` or `PresymplecticGauss()`."
         )
     if kind == "separable":
         explicit = "`Strang()` or `BlanesMoan4()`, which are explicit, or "
@@ -310,18 +309,17 @@ class TunedLinear8(AbstractSplitting):
     evaluations per step. Uses Hermite interpolation for dense/ts output, at the cost of
     three more steps.
 
-    For forces linear in the positions, by a matrix or a stencil: damped waves, networks
-    of springs, quadratic objectives. It allows the longest steps per force evaluation:
-    the error of a step is 1e-9 if the step times the highest frequency is 3.6, or 0.26
-    per evaluation. Its coefficients are tuned for a range of frequencies rather than
-    for short steps. With friction split between positions and momenta, $q = e^{-\eta /
+    For forces linear in the positions, by a matrix or a stencil, written as
+    [`diffrax_presym.QuadraticPotential`][]: damped waves, networks of springs,
+    quadratic objectives. It allows the longest steps per force evaluation: the error of
+    a step is 1e-9 if the step times the highest frequency is 3.6, or 0.26 per
+    evaluation. Its coefficients are tuned for a range of frequencies rather than for
+    short steps. With friction split between positions and momenta, $q = e^{-\gamma t /
     2} x$, the motion of $x$ is again an oscillation, so that constant friction costs no
     accuracy up to rates of twice the highest frequency.
 
-    Only of 4th order, and less accurate than [`diffrax_presym.TunedRKN6`][], if the
-    force is nonlinear, or if force or friction depends on time. Not for friction
-    $\gamma / t$ from $t = 0$. Interpolation over such long steps is inaccurate: to save
-    at many times, let steps end there, with `diffrax.StepTo`.
+    Any other system is refused. Interpolation over such long steps is inaccurate: to
+    save at many times, let steps end there, with `diffrax.StepTo`.
 
     Source: this package, `benchmarks/tuning.py`.
     """

@@ -161,10 +161,11 @@ class MechanicalSystem(AbstractSystem):
         splits: list[AbstractSplit] = [KineticSplit(kinds)]
         if isinstance(self.potential, QuadraticPotential):
             splits.append(PotentialSplit())
-        smooth = all(part.log_scale.is_smooth for part in parts.linear)
-        # Other energies quadratic in `p` may have a mass that depends on time.
-        if isinstance(kinetic, QuadraticKinetic) and has_one_rate(parts) and smooth:
-            splits.append(SharedSplit())
+            constant = all(part.log_scale.is_autonomous for part in parts.linear)
+            # Other energies quadratic in `p` may have a mass that depends on time.
+            known = isinstance(kinetic, QuadraticKinetic)
+            if known and constant and has_one_rate(parts):
+                splits.append(SharedSplit())
         return tuple(splits)
 
     @property

@@ -4,7 +4,6 @@ import math
 from typing import TYPE_CHECKING
 
 import equinox as eqx
-import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -118,25 +117,22 @@ class PotentialSplit(AbstractSplit):
 
 
 class SharedSplit(AbstractSplit):
-    r"""Half of the friction on positions and half on momenta, which leaves a force.
+    r"""Of a linear force and friction at one constant rate: half of the friction on
+    positions and half on momenta, which leaves a linear force.
 
-    With $q = e^{-\eta / 2} x$ the motion is
-    $M x'' = e^{\eta / 2} F + (\eta'^2 / 4 + \eta'' / 2) M x$. The pair is $q$ and
-    $p + \eta' M q / 2$, which are $e^{-\eta / 2}$ times $x$ and $M x'$; `enter` and
-    `leave` go from $(q, p)$ to it and back.
+    With $q = e^{-\gamma t / 2} x$ the motion is $M x'' = -K x + \gamma^2 M x / 4$. The
+    pair is $q$ and $p + \gamma M q / 2$, which are $e^{-\gamma t / 2}$ times $x$ and
+    $M x'$; `enter` and `leave` go from $(q, p)$ to it and back.
     """
 
     kinds: frozenset[str] = eqx.field(static=True, default=frozenset({"shared"}))
-
-    def times_mass(self, system: "System", x: PyTree) -> PyTree:
-        return system.term.kinetic.momentum(tree.values(x))
 
     def _shift(self, system: "System", t: Time, y: State, sign: float) -> State:
         law = system.one_rate
         if law is None:
             return y
-        shift = tree.scale(sign * law.rate(t), self.times_mass(system, y[0]))
-        return system.add(y, (None, shift))
+        shift = system.term.kinetic.momentum(tree.values(y[0]))
+        return system.add(y, (None, tree.scale(sign * law.rate(t), shift)))
 
     def enter(self, system: "System", t: Time, y: State) -> State:
         return self._shift(system, t, y, 0.5)
@@ -157,6 +153,5 @@ class SharedSplit(AbstractSplit):
         force, law = _potential_force(system, t, y), system.one_rate
         if law is None:
             return force
-        rate, change = jax.jvp(law.rate, (t,), (jnp.ones_like(t),))
-        mass = self.times_mass(system, y[0])
-        return tree.add(force, rate * rate / 4 + change / 2, mass)
+        mass = system.term.kinetic.momentum(tree.values(y[0]))
+        return tree.add(force, law.rate(t) ** 2 / 4, mass)

@@ -7,7 +7,7 @@ A system lists the splits that it allows, and a scheme needs one by kind:
   the other part, at fixed time;
 - `"nystrom"`: as any, and the part that drifts is quadratic, so that the commutator
   [kick, [kick, [kick, drift]]] vanishes, as Runge--Kutta--Nyström methods require;
-- `"shared"`: a second-order equation, with the friction turned into a force.
+- `"shared"`: a linear force, and constant friction turned into one.
 
 What a drift needs of time alone is prepared, for all stages of a step at once.
 """
