@@ -175,7 +175,7 @@ def successful(result) -> bool:
 def check_order(run: Run, claimed: float, rounding: float):
     """The slope over the three smallest steps with errors above rounding."""
     solve, errors = run.compiled, {}
-    numbers = [8, 12, 16] if run.way.prescribed else NUMBERS
+    numbers = [12, 16, 24] if run.way.prescribed else NUMBERS
     for n in numbers:
         saved, result = solve(n, run.system, run.y0)
         if not successful(result):

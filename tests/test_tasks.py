@@ -2,6 +2,7 @@
 
 import pathlib
 import runpy
+import sys
 
 import jax
 import pytest
@@ -11,7 +12,7 @@ TASKS = pathlib.Path(__file__).parents[1] / "examples" / "tasks"
 
 
 @pytest.mark.parametrize("name", sorted(x.stem for x in TASKS.glob("*.py")))
-def test_task(name, capfd):
+def test_task(name, capfd, monkeypatch):
     settings = dict(jax.config.values)
     changed = (
         "jax_enable_x64",
@@ -21,6 +22,7 @@ def test_task(name, capfd):
     try:
         for setting, value in zip(changed, (False, "standard", "allow"), strict=True):
             jax.config.update(setting, value)
+        monkeypatch.setattr(sys, "argv", [f"{name}.py"])
         runpy.run_path(str(TASKS / f"{name}.py"), run_name="__main__")
     finally:
         for setting in changed:
