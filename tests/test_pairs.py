@@ -186,11 +186,12 @@ def check_order(run: Run, claimed: float, rounding: float):
         errors[n] = error
     assert errors, "no solve was successful"
     assert min(errors.values()) < 0.1
-    # The errors of Tao's copies oscillate.
-    number = 6 if run.row["scheme"].name.startswith("Tao") else 3
+    # The errors of Tao's copies oscillate, and those of a kink depend on its phase.
+    kink = run.row["friction"].kind == "drag" and run.row["system"].size == 1
+    number = 6 if kink or run.row["scheme"].name.startswith("Tao") else 3
     last = sorted(errors)[-number:]
     drop = (last[-1] / last[0]) ** claimed
-    if len(last) < 3 or errors[last[0]] < max(30, 5 * drop) * rounding:
+    if len(last) < 3 or errors[last[0]] < max(30, 10 * drop) * rounding:
         # Too accurate for its order to be seen.
         return
     x, y = np.log(last), np.log([errors[n] for n in last])
