@@ -94,8 +94,8 @@ def SuzukiYoshida(
 
     The scheme of the paper. Its error constants are large, and its stages extend beyond
     both ends of the step, by up to 0.35, 0.65 and 0.92 of its length at orders 4, 6 and
-    8: there must be a force and a friction there, unlike with
-    [`diffrax_presym.LogDamping`][] near its singularity.
+    8. The system must be defined there: [`diffrax_presym.LogDamping`][] is not close to
+    its singularity.
 
     **Arguments:**
 
