@@ -8,7 +8,7 @@ from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, Scheme
 from ._engine import inverse, Stages
 from ._moves import FrozenDrift, Kick
-from ._splitting import find_split
+from ._splitting import find_split, first_force
 
 
 def _momentum_first(solver, system: System, known: bool = False) -> Stages:
@@ -115,13 +115,12 @@ class PresymplecticLeapfrog(AbstractPresymplecticSolver):
         return 2
 
     def scheme(self, system: System) -> Scheme:
-        halves = [(0, 0.5, 0.5), (0.5, 1, 0.5)]
         if self.first == "momentum":
             # In both directions the first kick is by the force known from the last one.
             A = _momentum_first(self, system, known=True)
-            force = lambda system, t, y: system.split("separable").force(system, t, y)
-            moves = Stages([A, inverse(A)], halves)
-            return Scheme(moves, start=force, end_force=lambda carry: carry)
+            moves = Stages([A, inverse(A)], [(0, 0.5, 0.5), (0.5, 1, 0.5)])
+            start = lambda system, t, y: first_force(system, "separable", t, y)
+            return Scheme(moves, start=start, end_force=lambda carry: carry)
         # Two kicks at the same position are merged.
         kick, drift = _momentum_first(self, system).moves
         table = [(0, 0.5, 0.5), (0.5, 0.5, 1), (0.5, 1, 0.5)]

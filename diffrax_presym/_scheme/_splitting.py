@@ -3,8 +3,10 @@ from typing import ClassVar, TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
+from jaxtyping import Array, PyTree
 
 from .._compositions import stages
+from .._numbers import State
 from .._system._bound import System
 from .._system._split import AbstractSplit
 from ._base import AbstractPresymplecticSolver, Scheme
@@ -68,13 +70,14 @@ class AbstractSplitting(AbstractPresymplecticSolver):
             return Scheme(Stages(moves, spans))
         return Scheme(
             Stages(moves, spans),
-            start=lambda system, t, y: _first_force(system, kind, t, y),
+            start=lambda system, t, y: first_force(system, kind, t, y),
             # Otherwise a kick is by a part of the force only.
             end_force=lambda carry: carry if "separable" in split.kinds else None,
         )
 
 
-def _first_force(system: System, kind: str, t, y):
+def first_force(system: System, kind: str, t: Array, y: State) -> PyTree:
+    """The force with which a scheme that starts with a kick starts."""
     split = system.split(kind)
     return split.force(system, t, split.enter(system, t, y) if kind == "shared" else y)
 

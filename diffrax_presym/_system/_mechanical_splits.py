@@ -42,16 +42,17 @@ class KineticSplit(AbstractSplit):
         return system.add(y, kinetic.flow(system.friction, t, h, data, p, system.args))
 
     def force(self, system, t, y) -> PyTree:
-        """The force, and other friction at the place."""
+        """The force, and the other friction at the place if there is any."""
+        force = _potential_force(system, t, y)
+        if "separable" in self.kinds:
+            return force
         parts, at = system.term.parts, (t, tree.values(y)[0], system.args)
         forms = [part.at(*at) for part in parts.local]
-        drags = [drag.at(*at) for drag in parts.drags]
-        force = _potential_force(system, t, y)
-        return (force, forms, drags) if forms or drags else force
+        return force, forms, [drag.at(*at) for drag in parts.drags]
 
     def kick(self, system, t, h, y, force, order) -> State:
         if "separable" in self.kinds:
-            return system.add(y, (None, tree.scale(h, force)))
+            return super().kick(system, t, h, y, force, order)
         (force, forms, drags), p = force, tree.values(y)[1]
         parts, mechanics = system.term.parts, system.term.mechanics
         pairs = zip(parts.local, forms, strict=True)
