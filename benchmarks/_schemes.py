@@ -25,9 +25,9 @@ SCHEMES = {
         dps.PresymplecticLeapfrog("position"), 2, 1
     ),
     "Strang": Scheme(dps.Strang(), 2, 1),
-    "PresymplecticYoshida4": Scheme(dps.PresymplecticYoshida4(), 4, 3),
-    "PresymplecticYoshida4, position first": Scheme(
-        dps.PresymplecticYoshida4("position"), 4, 3
+    "SuzukiYoshida(4)": Scheme(dps.SuzukiYoshida(4), 4, 3),
+    "SuzukiYoshida(4), position first": Scheme(
+        dps.SuzukiYoshida(4, dps.PresymplecticLeapfrog("position")), 4, 3
     ),
     "Suzuki4": Scheme(dps.Suzuki4(), 4, 5),
     "BlanesMoan4": Scheme(dps.BlanesMoan4(), 4, 6),

@@ -95,7 +95,7 @@ def canonical_form(potential, gamma):
 
 # Those that the groups of one scheme each compare.
 FEW = (
-    "PresymplecticEuler PresymplecticLeapfrog PresymplecticYoshida4 Suzuki4 "
+    "PresymplecticEuler PresymplecticLeapfrog SuzukiYoshida(4) Suzuki4 "
     "BlanesMoan4 BlanesMoanRKN4 SofroniouSpaletta(6) BlanesMoan6 BlanesMoanRKN6 "
     "SofroniouSpaletta(8) BlanesCasasRKN8"
 ).split()

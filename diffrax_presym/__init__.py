@@ -25,7 +25,6 @@ from ._scheme import (
     PresymplecticGauss as PresymplecticGauss,
     PresymplecticLeapfrog as PresymplecticLeapfrog,
     PresymplecticTao as PresymplecticTao,
-    PresymplecticYoshida4 as PresymplecticYoshida4,
     SofroniouSpaletta as SofroniouSpaletta,
     Splitting as Splitting,
     SplittingTableau as SplittingTableau,
@@ -42,7 +41,6 @@ from ._step_size import (
 )
 from ._system import (
     BregmanHamiltonian as BregmanHamiltonian,
-    ConformalHamiltonian as ConformalHamiltonian,
     DissipativeHamiltonian as DissipativeHamiltonian,
     EntropyMirror as EntropyMirror,
     EuclideanMirror as EuclideanMirror,

@@ -31,7 +31,7 @@ SCHEMES = {
     "leapfrog, momentum first": dps.PresymplecticLeapfrog(),
     "leapfrog, position first": dps.PresymplecticLeapfrog("position"),
     "Tao": dps.PresymplecticTao(),
-    "Yoshida 4": dps.PresymplecticYoshida4(),
+    "Yoshida 4": dps.SuzukiYoshida(4),
     "Suzuki-Yoshida 6": dps.SuzukiYoshida(6),
     "Suzuki-Yoshida 8": dps.SuzukiYoshida(8),
     "Blanes-Moan RKN 4": dps.BlanesMoanRKN4(),
@@ -52,7 +52,7 @@ def double_well(t, q, args):
 
 
 def system(potential, damping):
-    return dps.ConformalHamiltonian(dps.QuadraticKinetic(), potential, damping)
+    return dps.MechanicalSystem(dps.QuadraticKinetic(), potential, damping)
 
 
 DAMPED = system(harmonic, dps.ConstantDamping(0.2))
@@ -202,7 +202,7 @@ def speed(quick):
     steps, tols = [0.5, 0.25, 0.1, 0.05, 0.02], [1e-2, 1e-4, 1e-6, 1e-8, 1e-10]
     runs = {
         "leapfrog": (constant(PENDULUM, dps.PresymplecticLeapfrog()), steps),
-        "Yoshida 4": (constant(PENDULUM, dps.PresymplecticYoshida4()), steps),
+        "Yoshida 4": (constant(PENDULUM, dps.SuzukiYoshida(4)), steps),
         "Blanes-Moan RKN 4": (constant(PENDULUM, dps.BlanesMoanRKN4()), steps),
         "Blanes-Moan RKN 6": (constant(PENDULUM, dps.BlanesMoanRKN6()), steps),
         "Diffrax SemiImplicitEuler": (

@@ -340,16 +340,6 @@ SYSTEMS = [
         *(*_TWO, frozenset(), "joints"),
     ),
     System(
-        "conformal",
-        _one_law(lambda law: dps.ConformalHamiltonian(_quadratic(), _coupled, law)),
-        *(_own, _coupled_force, *_TWO, ALL, "one rate"),
-    ),
-    System(
-        *("conformal, any energy",),
-        _one_law(lambda law: dps.ConformalHamiltonian(energy=_mixed, damping=law)),
-        *(_mixed_velocity, _mixed_force, *_TWO, frozenset(), "one rate"),
-    ),
-    System(
         *("dissipative", _one_law(_dissipative), _dissipative_velocity, _driven_force),
         *(*_TWO, ALL, "one rate"),
     ),
@@ -712,7 +702,10 @@ SCHEMES = [
         *("leapfrog, position first", lambda: dps.PresymplecticLeapfrog("position")),
         *(2, "separable"),
     ),
-    Scheme("Yoshida4", dps.PresymplecticYoshida4, 4, "separable", inside=False),
+    Scheme(
+        *("Suzuki-Yoshida 4", lambda: dps.SuzukiYoshida(4), 4, "separable"),
+        inside=False,
+    ),
     Scheme(
         *("Suzuki-Yoshida 6", lambda: dps.SuzukiYoshida(6), 6, "separable"),
         inside=False,

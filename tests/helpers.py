@@ -53,8 +53,13 @@ SCHEMES = [
     Scheme("euler_B", dps.PresymplecticEuler("position"), 1, 1, symmetric=False),
     Scheme("leapfrog_AB", dps.PresymplecticLeapfrog("momentum"), 2, 1),
     Scheme("leapfrog_BA", dps.PresymplecticLeapfrog("position"), 2, 1),
-    Scheme("suzuki_yoshida_4", dps.PresymplecticYoshida4(), 4, 3),
-    Scheme("suzuki_yoshida_4_BA", dps.PresymplecticYoshida4("position"), 4, 3),
+    Scheme("suzuki_yoshida_4", dps.SuzukiYoshida(4), 4, 3),
+    Scheme(
+        "suzuki_yoshida_4_BA",
+        dps.SuzukiYoshida(4, dps.PresymplecticLeapfrog("position")),
+        4,
+        3,
+    ),
     Scheme("suzuki_yoshida_6", dps.SuzukiYoshida(6), 6, 9),
     Scheme("suzuki_yoshida_8", dps.SuzukiYoshida(8), 8, 27),
     Scheme("substeps", substeps(dps.PresymplecticLeapfrog(), 3), 2, 3),
@@ -143,7 +148,7 @@ def mixed_energy(t, q, p, args):
 
 
 def oscillator(gamma=0.2):
-    return dps.ConformalHamiltonian(
+    return dps.MechanicalSystem(
         dps.QuadraticKinetic(), harmonic, dps.ConstantDamping(gamma)
     )
 

@@ -38,11 +38,11 @@ def mixed(t, q, p, args):
 
 def separable(gamma):
     damping = dps.ConstantDamping(gamma)
-    return dps.ConformalHamiltonian(dps.QuadraticKinetic(), pendulum, damping)
+    return dps.MechanicalSystem(dps.QuadraticKinetic(), pendulum, damping)
 
 
 def nonseparable(gamma):
-    return dps.ConformalHamiltonian(energy=mixed, damping=dps.ConstantDamping(gamma))
+    return dps.Hamiltonian(mixed, dps.ConstantDamping(gamma))
 
 
 def add_up(tree):
@@ -217,7 +217,7 @@ def test_gradients_of_what_functions_of_the_term_close_over():
             def potential(t, q, args, *, scale=b):
                 return scale * inner(q) + args(q)
 
-            hamiltonian = dps.ConformalHamiltonian(
+            hamiltonian = dps.MechanicalSystem(
                 dps.QuadraticKinetic(), partial(potential, scale=d), lambda t: c * t
             )
             sol = dfx.diffeqsolve(
@@ -346,7 +346,7 @@ def damping_gradient(adjoint, inputs):
     def loss(inputs):
         q0, gamma = inputs
         dtype = q0.dtype
-        term = dps.ConformalHamiltonian(
+        term = dps.MechanicalSystem(
             dps.QuadraticKinetic(), undriven, dps.ConstantDamping(gamma)
         )
         # Early states are saved, as the final state does not depend on the initial one.
@@ -488,7 +488,7 @@ HOLDERS = {
 
 
 def _held(k, holder, adjoint):
-    hamiltonian = dps.ConformalHamiltonian(
+    hamiltonian = dps.MechanicalSystem(
         dps.QuadraticKinetic(), holder(k), dps.ConstantDamping(0.1)
     )
     y0 = (jnp.array([1.0]), jnp.array([0.0]))

@@ -18,7 +18,7 @@ def driven(t, q, args):
     return pendulum(t, q, args) + args * jnp.sin(t) * jnp.sum(q)
 
 
-DRIVEN = dps.ConformalHamiltonian(dps.QuadraticKinetic(), driven, dps.LogDamping(2.0))
+DRIVEN = dps.MechanicalSystem(dps.QuadraticKinetic(), driven, dps.LogDamping(2.0))
 
 
 def test_energies():

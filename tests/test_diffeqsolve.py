@@ -34,7 +34,7 @@ def swing(t, q, args):
 
 
 KINETIC = dps.QuadraticKinetic(np.array([1.0, 2.0]))
-SYSTEM = dps.ConformalHamiltonian(KINETIC, swing, dps.LogDamping(1.5))
+SYSTEM = dps.MechanicalSystem(KINETIC, swing, dps.LogDamping(1.5))
 TERM = SYSTEM
 OSCILLATOR = oscillator()
 Y0 = (jnp.array([1.0, -0.5]), jnp.array([0.3, 0.6]))
@@ -223,7 +223,7 @@ def test_there_and_back(scheme: Scheme):
 def test_negative_times():
     # The same system with the time shifted by four.
     y, _ = go(SCHEMES[2], 1.0, 2.0, Y0)
-    early = dps.ConformalHamiltonian(
+    early = dps.MechanicalSystem(
         KINETIC, lambda t, q, args: swing(t + 4, q, args), dps.LogDamping(1.5, shift=4)
     )
     term = early
@@ -418,7 +418,7 @@ def test_compositions_nest():
 
 # Implicit schemes
 
-MIXED = dps.ConformalHamiltonian(energy=mixed_energy, damping=dps.ConstantDamping(0.2))
+MIXED = dps.Hamiltonian(mixed_energy, dps.ConstantDamping(0.2))
 
 
 # With p' = 1 + p^2 the midpoint rule has no real solution for the step below.
@@ -465,7 +465,7 @@ def test_a_second_call_is_not_traced_again(scheme: Scheme):
     def system(gamma, mass):
         kinetic = dps.QuadraticKinetic(jnp.array(mass))
         damping = dps.ConstantDamping(jnp.array(gamma))
-        return dps.ConformalHamiltonian(kinetic, potential, damping)
+        return dps.MechanicalSystem(kinetic, potential, damping)
 
     end(system(0.1, 1.0), scheme.solver, Y0)
     times = len(traced)
@@ -506,7 +506,7 @@ def jolt(t, q, args):
 @pytest.mark.slow
 @of("leapfrog_AB", "tao")
 def test_a_clipped_solve_is_two_solves(scheme: Scheme):
-    system = dps.ConformalHamiltonian(KINETIC, jolt, dps.LogDamping(1.5))
+    system = dps.MechanicalSystem(KINETIC, jolt, dps.LogDamping(1.5))
 
     @eqx.filter_jit
     def end(solver, t0, t1, y0, jump_ts, rtol):

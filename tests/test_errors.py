@@ -36,7 +36,7 @@ BY_MATRIX = dps.MechanicalSystem(KINETIC, harmonic, dps.ViscousDamping(jnp.eye(2
 PAIR = (jnp.ones(2), jnp.ones(2))
 NONSEPARABLE = {
     "undamped": dps.Hamiltonian(mixed_energy),
-    "damped": dps.ConformalHamiltonian(energy=mixed_energy, damping=DAMPING),
+    "damped": dps.Hamiltonian(mixed_energy, DAMPING),
 }
 
 
@@ -383,7 +383,6 @@ MASS = "`QuadraticKinetic(mass)`"
 LAW = "must be a law of friction, a function eta(t) or a list of these"
 RATE = "`ConstantDamping(rate)`"
 ONE_RATE = "Only one rate of damping for all momenta has a log scale"
-EITHER = "either `kinetic` and `potential`, or `energy`"
 VECTOR = jnp.array([0.1, 0.2])
 
 HAMILTONIANS = {
@@ -484,12 +483,12 @@ HAMILTONIANS = {
         Mistake("returned shape (3,)", "`force` must return", "of shape (2,)"),
     ),
     "damping by a number": (
-        lambda: dps.ConformalHamiltonian(KINETIC, harmonic, 0.2),
+        lambda: dps.MechanicalSystem(KINETIC, harmonic, 0.2),
         Mistake("got 0.2", LAW, RATE),
     ),
     **{
         f"damping of the paper's family, {name}": (
-            lambda law=law: dps.ConformalHamiltonian(KINETIC, harmonic, law),
+            lambda law=law: dps.DissipativeHamiltonian(KINETIC, harmonic, DAMPING, law),
             Mistake("has other friction", ONE_RATE, RATE),
         )
         for name, law in {
@@ -507,19 +506,8 @@ HAMILTONIANS = {
         lambda: dps.ConstantDamping("weak"),
         Mistake("got 'weak'", "must be a real number", "`ConstantDamping(gamma)`"),
     ),
-    **{
-        f"parts {list(parts)}": (
-            lambda parts=parts: dps.ConformalHamiltonian(**parts),
-            Mistake("needs", EITHER, "`ConformalHamiltonian(kinetic, potential, damp"),
-        )
-        for parts in (
-            {"damping": DAMPING},
-            {"kinetic": KINETIC, "damping": DAMPING},
-            {"kinetic": KINETIC, "potential": harmonic, "energy": mixed_energy},
-        )
-    },
     "energy and damping by position": (
-        lambda: dps.ConformalHamiltonian(mixed_energy, DAMPING),
+        lambda: dps.MechanicalSystem(mixed_energy, DAMPING),
         Mistake(
             "got Damping(",
             "`potential` must be a function `V(t, q, args)`",

@@ -25,7 +25,7 @@ FINDER = optx.Newton(1e-13, 1e-13)
 
 
 def system(gamma=GAMMA):
-    return dps.ConformalHamiltonian(
+    return dps.MechanicalSystem(
         dps.QuadraticKinetic(), pendulum, dps.ConstantDamping(gamma)
     )
 
@@ -203,7 +203,7 @@ def test_events_backwards_in_time():
 # splitting, a copy.
 
 GOING_ON = {
-    "Yoshida": dps.PresymplecticYoshida4(),
+    "Yoshida": dps.SuzukiYoshida(4),
     "splitting": dps.BlanesMoanRKN4(),
     "Tao": dps.PresymplecticTao(5.0),
 }

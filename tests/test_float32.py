@@ -28,7 +28,7 @@ AUGMENTED = [scheme for scheme in SCHEMES if scheme.kind in ANY]
 # Canonical momentum overflows in `float32` at a log scale of 88.
 
 LATE = {
-    "constant": dps.ConformalHamiltonian(
+    "constant": dps.MechanicalSystem(
         dps.QuadraticKinetic(), harmonic, dps.ConstantDamping(1.0)
     ),
     "equal": dps.DissipativeHamiltonian(
@@ -37,10 +37,10 @@ LATE = {
         dps.ConstantDamping(1.0),
         dps.ConstantDamping(1.0),
     ),
-    "logarithmic": dps.ConformalHamiltonian(
+    "logarithmic": dps.MechanicalSystem(
         dps.QuadraticKinetic(), harmonic, dps.LogDamping(3.0, shift=1.0)
     ),
-    "relativistic": dps.ConformalHamiltonian(
+    "relativistic": dps.MechanicalSystem(
         dps.RelativisticKinetic(), harmonic, dps.ConstantDamping(1.0)
     ),
 }
@@ -85,28 +85,28 @@ HALF, ONE, TWO, THREE = map(np.float64, (0.5, 1.0, 2.0, 3.0))
 DAMPING = dps.LogDamping(THREE, shift=ONE)
 SYSTEMS = {
     "undamped": dps.MechanicalSystem(dps.QuadraticKinetic(TWO), harmonic),
-    "constant": dps.ConformalHamiltonian(
+    "constant": dps.MechanicalSystem(
         dps.QuadraticKinetic(jnp.array([1.0, 2.0])), harmonic, dps.ConstantDamping(HALF)
     ),
-    "matrix": dps.ConformalHamiltonian(
+    "matrix": dps.MechanicalSystem(
         dps.QuadraticKinetic(jnp.diag(jnp.array([1.0, 2.0]))), harmonic, DAMPING
     ),
-    "mixed": dps.ConformalHamiltonian(
+    "mixed": dps.MechanicalSystem(
         dps.QuadraticKinetic(TWO),
         harmonic,
         [dps.LogDamping(ONE), dps.PowerDamping(ONE, HALF)],
     ),
-    "callable": dps.ConformalHamiltonian(
+    "callable": dps.MechanicalSystem(
         dps.QuadraticKinetic(TWO), harmonic, lambda t: jnp.sin(t)
     ),
     "unequal": dps.DissipativeHamiltonian(
         dps.QuadraticKinetic(TWO), harmonic, DAMPING, dps.ConstantDamping(HALF)
     ),
-    "relativistic": dps.ConformalHamiltonian(
+    "relativistic": dps.MechanicalSystem(
         dps.RelativisticKinetic(ONE, TWO), harmonic, DAMPING
     ),
-    "any T": dps.ConformalHamiltonian(soft_kinetic, harmonic, DAMPING),
-    "nonseparable": dps.ConformalHamiltonian(energy=mixed_energy, damping=DAMPING),
+    "any T": dps.MechanicalSystem(soft_kinetic, harmonic, DAMPING),
+    "nonseparable": dps.Hamiltonian(mixed_energy, DAMPING),
 }
 NEEDS = {
     "relativistic": ("frozen", "split", *ANY),
@@ -175,7 +175,7 @@ MIXED = {
 }
 MIXED_SYSTEMS = {
     "undamped": dps.MechanicalSystem(dps.QuadraticKinetic(TWO), cosine),
-    "constant": dps.ConformalHamiltonian(
+    "constant": dps.MechanicalSystem(
         dps.QuadraticKinetic(TWO), cosine, dps.ConstantDamping(HALF)
     ),
     "unequal": dps.DissipativeHamiltonian(

@@ -77,7 +77,7 @@ def test_prepared_friction_solves_its_equation(law, rate):
 
 
 def test_diagnostics_take_integer_times():
-    system = dps.ConformalHamiltonian(
+    system = dps.MechanicalSystem(
         dps.QuadraticKinetic(), harmonic, dps.ConstantDamping(0.1)
     )
     y = jnp.array([0.3]), jnp.array([0.7])
@@ -88,7 +88,7 @@ def test_diagnostics_take_integer_times():
 
 
 def singular_system(law):
-    return dps.ConformalHamiltonian(dps.QuadraticKinetic(), harmonic, law)
+    return dps.MechanicalSystem(dps.QuadraticKinetic(), harmonic, law)
 
 
 def test_any_solver_of_diffrax_starts_from_rest():
@@ -175,6 +175,6 @@ def test_relativistic_kinetic_energy_does_not_overflow(p, mass):
     np.testing.assert_allclose(kinetic(t, p), energy, rtol=1e-6)
     assert np.all(np.isfinite(jax.jacrev(kinetic.velocity, 1)(t, p)))
     for law in (dps.ConstantDamping(jnp.float32(0.5)), None):
-        system = dps.ConformalHamiltonian(kinetic, harmonic, law)
+        system = dps.MechanicalSystem(kinetic, harmonic, law)
         q, _ = drift(system, t, jnp.float32(1.0), 0 * p, p)
         assert np.all(np.isfinite(q))

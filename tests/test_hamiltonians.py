@@ -100,23 +100,23 @@ HAMILTONIANS = {
         lambda t, q, P: energy(t, q, P, ARGS),
     ),
     "conformal, undamped": (
-        dps.ConformalHamiltonian(QUADRATIC, potential),
+        dps.MechanicalSystem(QUADRATIC, potential),
         lambda t, q, P: quadratic(P) + potential(t, q, ARGS),
     ),
     "conformal, quadratic T": (
-        dps.ConformalHamiltonian(QUADRATIC, potential, LOG),
+        dps.MechanicalSystem(QUADRATIC, potential, LOG),
         conformal(lambda t, p: quadratic(p), log),
     ),
     "conformal, relativistic T": (
-        dps.ConformalHamiltonian(RELATIVISTIC, potential, CONSTANT),
+        dps.MechanicalSystem(RELATIVISTIC, potential, CONSTANT),
         conformal(lambda t, p: relativistic(p), constant),
     ),
     "conformal, any T": (
-        dps.ConformalHamiltonian(kinetic, potential, eta1),
+        dps.MechanicalSystem(kinetic, potential, eta1),
         conformal(lambda t, p: kinetic(t, p, ARGS), eta1),
     ),
     "conformal, nonseparable": (
-        dps.ConformalHamiltonian(energy=energy, damping=LOG),
+        dps.Hamiltonian(energy, LOG),
         lambda t, q, P: jnp.exp(log(t)) * energy(t, q, jnp.exp(-log(t)) * P, ARGS),
     ),
     "dissipative, quadratic T": (
@@ -180,7 +180,7 @@ def test_vector_field_is_hamilton_s_equations(hamiltonian, H):
 
 def test_equal_damping_is_conformal():
     one = dps.DissipativeHamiltonian(QUADRATIC, potential, LOG, LOG)
-    two = dps.ConformalHamiltonian(QUADRATIC, potential, LOG)
+    two = dps.MechanicalSystem(QUADRATIC, potential, LOG)
     for name in ("energy", "canonical", "velocity", "force"):
         first, second = (getattr(h, name)(T, Q, P, ARGS) for h in (one, two))
         assert_close(first, second, 1e-15)
@@ -309,7 +309,7 @@ def test_increments_are_exact_at_late_times(law, eta, h, dtype, tolerance):
 
 def test_no_damping_is_the_limit_of_little_damping():
     y = (Q, P)
-    field = lambda damping: dps.ConformalHamiltonian(QUADRATIC, potential, damping).vf(
+    field = lambda damping: dps.MechanicalSystem(QUADRATIC, potential, damping).vf(
         T, y, ARGS
     )
     for law in (dps.ConstantDamping, dps.LogDamping):
@@ -324,7 +324,7 @@ def test_a_relativistic_drift_through_friction_that_stops_it(dtype):
 
     def moved(gamma):
         damping = dps.ConstantDamping(gamma)
-        system = dps.ConformalHamiltonian(RELATIVISTIC, potential, damping)
+        system = dps.MechanicalSystem(RELATIVISTIC, potential, damping)
         start = jnp.zeros((), dtype)
         q, _ = drift(system, start, jnp.ones((), dtype), jnp.zeros_like(p), p)
         return q

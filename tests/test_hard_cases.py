@@ -23,7 +23,7 @@ def conservative(potential, mass=None):
 
 
 def damped(potential, damping):
-    return dps.ConformalHamiltonian(dps.QuadraticKinetic(), potential, damping)
+    return dps.MechanicalSystem(dps.QuadraticKinetic(), potential, damping)
 
 
 def last(sol):
@@ -92,7 +92,7 @@ def test_singular_damping_from_its_start(solver, t0):
 def test_stages_before_the_start_are_reported():
     system = damped(harmonic, dps.LogDamping(3.0))
     run = lambda solver: solve(system, solver, 1e-6, 1.0, 0.01, REST, throw=False)
-    assert run(dps.PresymplecticYoshida4()).result == NONFINITE
+    assert run(dps.SuzukiYoshida(4)).result == NONFINITE
     assert run(dps.Suzuki4()).result == dfx.RESULTS.successful
 
 

@@ -15,9 +15,7 @@ import diffrax_presym as dps
 
 
 MIXED = dps.Hamiltonian(mixed_energy)
-DAMPED = dps.ConformalHamiltonian(
-    energy=mixed_energy, damping=dps.ConstantDamping(0.05)
-)
+DAMPED = dps.Hamiltonian(mixed_energy, dps.ConstantDamping(0.05))
 START = (jnp.array([-3.0]), jnp.array([0.0]))
 FINDER = optx.Newton(rtol=1e-12, atol=1e-12)
 

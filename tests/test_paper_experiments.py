@@ -26,7 +26,7 @@ def as_user():
 
 def system(gamma):
     damping = dps.ConstantDamping(gamma)
-    return dps.ConformalHamiltonian(dps.QuadraticKinetic(), phase.potential, damping)
+    return dps.MechanicalSystem(dps.QuadraticKinetic(), phase.potential, damping)
 
 
 @pytest.mark.slow

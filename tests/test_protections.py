@@ -20,7 +20,7 @@ BASES = [
     dps.BlanesMoanRKN4(),
 ]
 each_base = pytest.mark.parametrize("base", BASES, ids=lambda x: type(x).__name__)
-HENON = dps.ConformalHamiltonian(
+HENON = dps.MechanicalSystem(
     dps.QuadraticKinetic(jnp.array([1.0, 2.0])), henon_heiles, dps.ConstantDamping(0.3)
 )
 Y0 = (jnp.array([0.3, -0.1]), jnp.array([0.1, 0.2]))

@@ -61,7 +61,7 @@ def test_a_scheme_for_linear_systems_refuses_others(potential, law):
 @pytest.mark.parametrize("gamma", [40.0, 100.0])
 def test_saved_times_with_strong_friction(gamma):
     # Of many unknowns.
-    system = dps.ConformalHamiltonian(
+    system = dps.MechanicalSystem(
         dps.QuadraticKinetic(),
         lambda t, q, args: -jnp.sum(jnp.cos(q)),
         dps.ConstantDamping(gamma),
@@ -162,7 +162,7 @@ def test_an_energy_that_is_infinite_at_the_distance_one():
     "saveat", [dfx.SaveAt(t1=True), dfx.SaveAt(ts=np.array([0.5, 40.0]))]
 )
 def test_a_step_that_is_too_large_is_a_failure(saveat):
-    system = dps.ConformalHamiltonian(
+    system = dps.MechanicalSystem(
         dps.QuadraticKinetic(), lambda t, q, args: jnp.sum(q**4) / 4, None
     )
     sol = dfx.diffeqsolve(

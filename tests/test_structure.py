@@ -68,7 +68,7 @@ MASS = jnp.array([[2.0, 0.3], [0.3, 1.0]])
 
 
 def damped(kinetic, damping):
-    return dps.ConformalHamiltonian(kinetic, swinging, damping)
+    return dps.MechanicalSystem(kinetic, swinging, damping)
 
 
 def quadratic(damping):
@@ -151,7 +151,7 @@ def test_form_contracts_for_any_kinetic_energy(scheme: Scheme):
 @each([*IMPLICIT, *AUGMENTED])
 def test_form_contracts_for_nonseparable_energies(scheme: Scheme):
     law, eta = DAMPINGS["logarithmic"]
-    hamiltonian = dps.ConformalHamiltonian(energy=swinging_energy, damping=law)
+    hamiltonian = dps.Hamiltonian(swinging_energy, law)
     # An implicit scheme is symplectic to the tolerance of its root finder.
     tolerance = 1e-9 if scheme in IMPLICIT else 1e-13
     assert structure_defect(hamiltonian, scheme, contraction(eta)) < tolerance
@@ -201,9 +201,7 @@ def test_a_step_backwards_undoes_a_step(scheme: Scheme, hamiltonian):
 @pytest.mark.slow
 @each([*IMPLICIT, *AUGMENTED], symmetric=True)
 def test_a_step_backwards_undoes_a_nonseparable_step(scheme: Scheme):
-    hamiltonian = dps.ConformalHamiltonian(
-        energy=swinging_energy, damping=dps.LogDamping(3.0)
-    )
+    hamiltonian = dps.Hamiltonian(swinging_energy, dps.LogDamping(3.0))
     tolerance = 1e-10 if scheme in IMPLICIT else 2e-14
     check_symmetry(hamiltonian, scheme.solver, scheme.solver, tolerance)
 
@@ -251,7 +249,7 @@ PAIRS = {
     ),
 }
 ENTANGLED = (
-    dps.ConformalHamiltonian(energy=swinging_energy, damping=dps.LogDamping(3.0)),
+    dps.Hamiltonian(swinging_energy, dps.LogDamping(3.0)),
     Canonical(
         lambda t, q, P: (1 + np.sin(t) / 4) * (1 + q @ q) * P / t**3,
         lambda t, q, P: (1 + np.sin(t) / 4) * (t**3 + P @ P / t**3) * q,

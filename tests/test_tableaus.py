@@ -84,7 +84,7 @@ SYSTEMS = {
         eta1=dps.ConstantDamping(0.1),
         eta2=dps.LogDamping(1.0, shift=1.0),
     ),
-    "double well": dps.ConformalHamiltonian(
+    "double well": dps.MechanicalSystem(
         dps.QuadraticKinetic(),
         driven_double_well,
         [dps.LogDamping(0.3), dps.PowerDamping(0.1, 0.5)],

@@ -90,7 +90,7 @@ def quartic(t, p, args):
 
 
 def swapped(damping, kinetic: Any = quartic):
-    return dps.ConformalHamiltonian(kinetic, dps.QuadraticPotential(MATRIX), damping)
+    return dps.MechanicalSystem(kinetic, dps.QuadraticPotential(MATRIX), damping)
 
 
 @each_rkn
@@ -108,7 +108,7 @@ def test_swapped_roles_from_the_start_of_friction_that_is_infinite_there():
 
 
 def test_refusal_names_the_quadratic_potential():
-    system = dps.ConformalHamiltonian(dps.RelativisticKinetic(), pendulum, None)
+    system = dps.MechanicalSystem(dps.RelativisticKinetic(), pendulum, None)
     with pytest.raises(ValueError, match="`QuadraticPotential\\(stiffness\\)`"):
         solve(system, dps.BlanesMoanRKN6(), 0.0, 1.0, 0.1, Y0)
 
@@ -155,7 +155,7 @@ def test_long_steps_of_a_linear_system(gamma):
     # Frequencies up to the claimed limit for an error of 1e-9 per step.
     omega = jnp.linspace(0.1, 3.6, 50)
     damping = dps.ConstantDamping(gamma)
-    system = dps.ConformalHamiltonian(
+    system = dps.MechanicalSystem(
         dps.QuadraticKinetic(), dps.QuadraticPotential(omega**2), damping
     )
     y0 = jnp.ones(50), jnp.zeros(50)
@@ -180,7 +180,7 @@ MASSES: dict[str, Any] = {
 
 @pytest.mark.parametrize("mass", MASSES.values(), ids=MASSES)
 def test_masses_of_linear_systems(mass):
-    system = dps.ConformalHamiltonian(
+    system = dps.MechanicalSystem(
         dps.QuadraticKinetic(mass),
         dps.QuadraticPotential(MATRIX),
         dps.ConstantDamping(0.8),
@@ -190,7 +190,7 @@ def test_masses_of_linear_systems(mass):
 
 
 def linear(damping):
-    return dps.ConformalHamiltonian(
+    return dps.MechanicalSystem(
         dps.QuadraticKinetic(jnp.array([1.0, 3.0])),
         dps.QuadraticPotential(MATRIX),
         damping,

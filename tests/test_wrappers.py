@@ -26,12 +26,10 @@ import diffrax_presym as dps
 
 
 Y0 = (jnp.array([0.3, -0.2]), jnp.array([0.1, 0.4]))
-DAMPED = dps.ConformalHamiltonian(
+DAMPED = dps.MechanicalSystem(
     dps.QuadraticKinetic(), henon_heiles, dps.LogDamping(1.0, shift=1.0)
 )
-NONSEPARABLE = dps.ConformalHamiltonian(
-    energy=mixed_energy, damping=dps.ConstantDamping(0.3)
-)
+NONSEPARABLE = dps.Hamiltonian(mixed_energy, dps.ConstantDamping(0.3))
 T0, T1 = 0.5, 0.6
 WRAPPERS = {
     "compensated": dps.Compensated,

@@ -112,7 +112,7 @@ def LogDamping(gamma, shift: ArrayLike | None = None) -> Damping:
     The rate is infinite at $t = -s$. With positive damping a solve may start there,
     from zero momentum; there splittings with a quadratic kinetic energy have at most
     order $\gamma + 1$, and other schemes order 2. Schemes whose stages extend beyond
-    the step, such as [`diffrax_presym.PresymplecticYoshida4`][], must start far enough
+    the step, such as [`diffrax_presym.SuzukiYoshida`][], must start far enough
     from there; otherwise the solve fails.
 
     **Arguments:**

@@ -2,7 +2,6 @@ from ._base import AbstractPresymplecticSolver as AbstractPresymplecticSolver
 from ._compensated import Compensated as Compensated
 from ._composition import (
     Composition as Composition,
-    PresymplecticYoshida4 as PresymplecticYoshida4,
     SofroniouSpaletta as SofroniouSpaletta,
     Suzuki4 as Suzuki4,
     SuzukiYoshida as SuzukiYoshida,

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from decimal import Decimal, localcontext
-from typing import Literal
 
 import equinox as eqx
 
@@ -136,35 +135,6 @@ def SuzukiYoshida(
     return Composition(_leapfrog_if_none(base), triple_jump(order), order)
 
 
-def PresymplecticYoshida4(
-    first: Literal["momentum", "position"] = "momentum",
-) -> Composition:
-    """The fourth-order method of Creutz and Gocksch, Forest and Ruth, Suzuki, Yoshida.
-
-    4th order and symmetric. Three force evaluations per step. Uses Hermite
-    interpolation for dense/ts output, at the cost of another step.
-
-    The fourth-order scheme of the paper, [`diffrax_presym.SuzukiYoshida`][]`(4)`.
-
-    **Arguments:** as [`diffrax_presym.PresymplecticLeapfrog`][].
-
-    **Returns:** a [`diffrax_presym.Composition`][].
-
-    ??? cite "Reference"
-
-        Equation (yoshida_comp) with `r = 1` of França, Jordan and Vidal (2021), after
-
-        ```bibtex
-        @article{forest1990fourth,
-            author={Forest, Etienne and Ruth, Ronald D.},
-            title={Fourth-order symplectic integration},
-            journal={Physica D: Nonlinear Phenomena}, volume={43}, number={1},
-            pages={105--117}, year={1990}}
-        ```
-    """
-    return SuzukiYoshida(4, PresymplecticLeapfrog(first))
-
-
 def Suzuki4(base: AbstractPresymplecticSolver | None = None) -> Composition:
     """Suzuki's fourth-order composition of five stages.
 
@@ -172,7 +142,7 @@ def Suzuki4(base: AbstractPresymplecticSolver | None = None) -> Composition:
     Uses Hermite interpolation for dense/ts output, at the cost of another step.
 
     Its error is several times smaller than that of the triple jump
-    ([`diffrax_presym.PresymplecticYoshida4`][]) at equal cost, and its stages stay
+    ([`diffrax_presym.SuzukiYoshida`][]) at equal cost, and its stages stay
     within the step.
 
     Source: Suzuki (1990), see [`diffrax_presym.SuzukiYoshida`][].

@@ -13,7 +13,6 @@ from ._mirror import (
 )
 from ._pairwise import pairwise_potential as pairwise_potential
 from ._paper import (
-    ConformalHamiltonian as ConformalHamiltonian,
     DissipativeHamiltonian as DissipativeHamiltonian,
 )
 from ._potential import (

@@ -1,4 +1,4 @@
-"""The families of Hamiltonians of the paper, as systems."""
+"""The general family of Hamiltonians of the paper, as a system."""
 
 import math
 from typing import Any, ClassVar
@@ -13,7 +13,6 @@ from .._friction._damping import as_laws, ConstantDamping, Damping
 from .._friction._fit import fit_friction, one_rate
 from .._friction._linear import LinearFriction
 from .._numbers import as_time, Scalar, Time
-from ._energy import Hamiltonian
 from ._kinetic import (
     AbstractKinetic,
     as_kinetic,
@@ -21,49 +20,6 @@ from ._kinetic import (
     prepare_quadrature,
 )
 from ._mechanical import MechanicalSystem
-
-
-def ConformalHamiltonian(
-    kinetic=None, potential=None, damping=None, *, energy=None
-) -> MechanicalSystem | Hamiltonian:
-    r"""Any energy $E$ with friction: $q' = \partial E/\partial p$ and
-    $p' = -\partial E/\partial q - \eta'(t) \, p$.
-
-    The (generalised) conformal Hamiltonian systems, equations (gen_conf) and
-    (new_ham_time) of França, Jordan and Vidal (2021), with
-    $H(t, q, P) = e^{\eta(t)} E(t, q, e^{-\eta(t)} P)$. The energy may depend on time.
-
-    **Arguments:**
-
-    - `kinetic`, `potential`: a separable energy, as for
-        [`diffrax_presym.MechanicalSystem`][].
-    - `damping`: a law of one rate for all momenta such as
-        [`diffrax_presym.ConstantDamping`][], or a function `eta(t)`, the integral of
-        the rate. Defaults to no damping.
-    - `energy`: in place of the first two an energy that is not separable, as for
-        [`diffrax_presym.Hamiltonian`][].
-
-    **Returns:**
-
-    A [`diffrax_presym.MechanicalSystem`][] or a [`diffrax_presym.Hamiltonian`][].
-
-    **Raises:**
-
-    `ValueError` if both or neither of the two forms is given, if there is other
-    friction than one rate for all momenta, and as for these classes.
-    """
-    if energy is None and kinetic is not None and potential is not None:
-        system = MechanicalSystem(kinetic, potential, damping)
-    elif energy is not None and kinetic is None and potential is None:
-        system = Hamiltonian(energy, damping)
-    else:
-        raise ValueError(
-            "`ConformalHamiltonian` needs either `kinetic` and `potential`, or "
-            "`energy`. Write `ConformalHamiltonian(kinetic, potential, damping)` or "
-            "`ConformalHamiltonian(energy=energy, damping=damping)`."
-        )
-    _ = system.damping  # An error if there is other friction.
-    return system
 
 
 def DissipativeHamiltonian(kinetic, potential, eta1, eta2) -> MechanicalSystem:
@@ -75,7 +31,7 @@ def DissipativeHamiltonian(kinetic, potential, eta1, eta2) -> MechanicalSystem:
     $E = e^{-\eta_1 - \eta_2} T(t, e^{\eta_2} p) + f(t, q)$. For
     [`diffrax_presym.QuadraticKinetic`][] that is $e^{\eta_2 - \eta_1} T(p) + f$, and
     with $\eta_1 = \eta_2$ the same system as
-    [`diffrax_presym.ConformalHamiltonian`][].
+    [`diffrax_presym.MechanicalSystem`][]`(T, f, eta1)`.
 
     The kinetic energies of this package do not evaluate the exponential of $\eta_2$
     itself. A plain function does, and overflows in `float32` once $2 \eta_2$ exceeds

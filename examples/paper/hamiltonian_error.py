@@ -14,7 +14,9 @@ from examples.schemes import hamiltonian_error, slope
 SCHEMES = {
     "Euler": dps.PresymplecticEuler,
     "leapfrog": dps.PresymplecticLeapfrog,
-    "Suzuki-Yoshida": dps.PresymplecticYoshida4,
+    "Suzuki-Yoshida": lambda first: dps.SuzukiYoshida(
+        4, dps.PresymplecticLeapfrog(first)
+    ),
 }
 
 

@@ -63,7 +63,7 @@ def _matrix(a, b, c, d):
 METHODS = {
     "leapfrog": (dps.PresymplecticLeapfrog(), leapfrog),
     "Nesterov": (Nesterov(), nesterov),
-    "Suzuki-Yoshida 4": (dps.PresymplecticYoshida4(), yoshida),
+    "Suzuki-Yoshida 4": (dps.SuzukiYoshida(4), yoshida),
     "Euler, momentum first (heavy ball)": (dps.PresymplecticEuler(), euler_momentum),
     "Euler, position first": (dps.PresymplecticEuler("position"), euler_position),
 }
@@ -117,7 +117,7 @@ def final_gradients(solver, gammas, hs, eigenvalues, q0, iterations=800):
     """The final norm of the gradient, for each gamma (rows) and h (columns)."""
 
     def final_gradient(gamma, h):
-        hamiltonian = dps.ConformalHamiltonian(
+        hamiltonian = dps.MechanicalSystem(
             dps.QuadraticKinetic(), potential, dps.ConstantDamping(gamma)
         )
         sol = dfx.diffeqsolve(

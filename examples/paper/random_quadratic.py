@@ -28,7 +28,7 @@ METHODS = {
 SHAPES = {"n / 0.8 rows (script)": 1 / 0.8, "0.8 n rows (text)": 0.8}
 
 
-HAMILTONIAN = dps.ConformalHamiltonian(
+HAMILTONIAN = dps.MechanicalSystem(
     dps.QuadraticKinetic(), potential, dps.ConstantDamping(GAMMA)
 )
 

@@ -21,7 +21,7 @@ SYSTEMS = {
 SCHEMES = {
     "Euler": dps.PresymplecticEuler(),
     "leapfrog": dps.PresymplecticLeapfrog(),
-    "Suzuki-Yoshida": dps.PresymplecticYoshida4(),
+    "Suzuki-Yoshida": dps.SuzukiYoshida(4),
 }
 METHODS = {
     "exact (order 8)": HIGH,
