@@ -41,6 +41,8 @@ SCHEMES = {
     "SofroniouSpaletta(8)": Scheme(dps.SofroniouSpaletta(8), 8, 21),
     "BlanesCasasRKN8": Scheme(dps.BlanesCasasRKN8(), 8, 19),
     "TunedLinear8": Scheme(dps.TunedLinear8(), 8, 14),
+    "SymmetricMultistep(8)": Scheme(dps.SymmetricMultistep(8), 8, 1),
+    "SymmetricMultistep(10)": Scheme(dps.SymmetricMultistep(10), 10, 1),
     "SofroniouSpaletta(10)": Scheme(dps.SofroniouSpaletta(10), 10, 35),
     "PresymplecticTao": Scheme(dps.PresymplecticTao(), 2, 3),
     # Six stages at once, in each of several iterations.

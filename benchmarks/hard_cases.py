@@ -1,8 +1,4 @@
-"""The hard cases: errors and costs of all kinds of schemes, one table per group.
-
-Errors are the same on any machine; costs are ratios of times of interleaved runs, the
-median of several.
-"""
+"""The hard cases: errors of all kinds of schemes, one table per group."""
 
 import functools
 import pathlib
@@ -18,7 +14,6 @@ from _plot import panels, save, slope
 from _report import command_line, Table
 from _schemes import SCHEMES, stability_limit, step_matrices
 from _solve import CONSTANT, last, reference, reference_end, solve
-from _timing import interleaved
 from problems import henon_heiles as damped_henon_heiles, mechanics
 
 import diffrax_presym as dps
@@ -393,35 +388,6 @@ def broken(quick):
         table.row(name, *cells)
 
 
-def prices(quick):
-    """Times of a solve with damping or compensated summation over those without."""
-    free = mechanics(pendulum)
-    systems = {
-        "constant": mechanics(pendulum, dps.ConstantDamping(0.1)),
-        "1/t": mechanics(pendulum, dps.LogDamping(3.0, 1.0)),
-        "Compensated": free,
-    }
-    table = Table(
-        "What damping and compensated summation cost, times the bare solve",
-        *("unknowns:>8", "scheme:<8", *(f"{name}:>11.2f" for name in systems)),
-    )
-    for size in (1, 100, 1000):
-        y0 = (jnp.full(size, 0.5), jnp.zeros(size))
-        # Powers of two, so that every side takes as many steps.
-        steps = 2 ** {1: 19, 100: 15, 1000: 13}[size] // (32 if quick else 1)
-        for scheme, base in (("leapfrog", LEAPFROG), ("RKN6", RKN6)):
-            call = lambda system, solver, y0=y0, steps=steps: functools.partial(
-                run, system, solver, 0.0, steps / 16, 1 / 16, y0
-            )
-            calls = {
-                name: call(s, dps.Compensated(base) if s is free else base)
-                for name, s in systems.items()
-            }
-            found = interleaved(calls | {"bare": call(free, base)}, 3 if quick else 9)
-            cells = [found[name].over(found["bare"]) for name in systems]
-            table.row(size, scheme, *cells)
-
-
 def pictures(series, growth, folder):
     fig, (ax,) = panels(1, 1, (7, 4))
     for name in (name for name, drag in series if drag is None):
@@ -453,7 +419,7 @@ def main():
     options = parser.parse_args()
     groups = (
         *(overflow, stability, long_times, kepler, encounters, chaos),
-        *(singular_damping, non_smooth, broken, prices),
+        *(singular_damping, non_smooth, broken),
     )
     out = {}
     for group in groups:

@@ -80,11 +80,8 @@ def measured(problem, repeats):
 
 def main():
     options = command_line(__doc__).parse_args()
-    makers = [
-        make for make in problems.PROBLEMS if make is not problems.random_quadratic
-    ]
-    if options.quick:
-        makers = makers[:1]
+    makers = [make for make in problems.PROBLEMS if make.__name__ != "random_quadratic"]
+    makers = makers[: 1 if options.quick else None]
     table = Table(
         f"Microseconds of one trajectory to an error of {TARGET:.0e}",
         *(":<24", "ours:<16", "time:>6.0f", "call:>6.0f", "forces:>7.0f"),

@@ -50,6 +50,7 @@ OURS = [
     *("PresymplecticLeapfrog", "Suzuki4", "SofroniouSpaletta(8)"),
     *("BlanesMoan4", "BlanesMoan6", "BlanesMoanRKN4", "BlanesMoanRKN6"),
     *("BlanesCasasRKN8", "TunedRKN6", "TunedLinear8"),
+    *("SymmetricMultistep(8)", "SymmetricMultistep(10)"),
 ]
 # For energies that are not separable; Gauss to rounding, and to two tolerances.
 OTHERS = {
@@ -158,17 +159,22 @@ def all_runs(problem, quick, ts=None):
 
 def evaluations(t1, ts, key, found):
     """Of the force in a solve. Each saved time within a step costs as much as a step,
-    except with Gauss collocation and the solvers of Diffrax."""
+    except with Gauss collocation and the solvers of Diffrax; with the multistep method
+    as much as a step of its start."""
     (group, name), steps = key, found[1]
     known = {"SemiImplicitEuler": 1, "heyoka": math.nan}
     known |= {x: scheme.evaluations for x, scheme in (SCHEMES | DIFFRAX).items()}
     known |= {x: scheme.evaluations for x, scheme in OTHERS.items()}
-    cost = known[name if name in known else name.split(",")[0]]
-    free = group != "ours" or "Gauss" in name
-    if ts is None or free:
-        return cost * steps
+    cost = between = known[name if name in known else name.split(",")[0]]
+    start = 0
+    if "Multistep" in name:
+        between = known["BlanesCasasRKN8"]
+        start = between * min(steps, SCHEMES[name].order - 1)
+    if ts is None or group != "ours" or "Gauss" in name:
+        return start + cost * steps
     at = ts / t1 * steps
-    return cost * (steps + np.sum(np.abs(at - np.round(at)) > 1e-6))
+    inside = np.sum(np.abs(at - np.round(at)) > 1e-6)
+    return start + cost * steps + between * inside
 
 
 def tables(results):

@@ -31,6 +31,7 @@ from ._scheme import (
     Strang as Strang,
     Suzuki4 as Suzuki4,
     SuzukiYoshida as SuzukiYoshida,
+    SymmetricMultistep as SymmetricMultistep,
     TunedLinear8 as TunedLinear8,
     TunedRKN6 as TunedRKN6,
 )

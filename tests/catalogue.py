@@ -33,7 +33,8 @@ START, LENGTH = 0.25, 1.5
 
 SPLIT = frozenset({"separable", "any"})
 ALL = SPLIT | {"nystrom"}
-LINEAR = ALL | {"shared"}
+RATE = ALL | {"shared"}
+LINEAR = RATE | {"linear"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -287,31 +288,31 @@ def _whirl_force(t, q, p):
 SYSTEMS = [
     System(
         *("pendulum", _mechanical(_quadratic(), _pendulum), _own, _pendulum_force),
-        *(*_ONE, ALL, "all", np.eye(1)),
+        *(*_ONE, RATE, "all", np.eye(1)),
         bodies=True,
     ),
     System(
         *("mass matrix", _mechanical(_quadratic(_MASS), _coupled), _inverse(_MASS)),
-        *(_coupled_force, *_TWO, ALL, "all", _MASS),
+        *(_coupled_force, *_TWO, RATE, "all", _MASS),
     ),
     System(
         *("bodies", _mechanical(_quadratic(np.array([[1.0], [1.5]])), _pair)),
-        *(_inverse(_MASSES), _pair_force, *_PLANE, ALL, "all", _MASSES),
+        *(_inverse(_MASSES), _pair_force, *_PLANE, RATE, "all", _MASSES),
         bodies=True,
     ),
     System(
         *("driven", _mechanical(_quadratic(), _driven), _own, _driven_force),
-        *(*_TWO, ALL, "all", np.eye(2)),
+        *(*_TWO, RATE, "all", np.eye(2)),
         bodies=True,
     ),
     System(
         *("chain of 20", _mechanical(_quadratic(), _chain), _own, _chain_force),
-        *(*_LONG, ALL, "all", np.eye(20)),
+        *(*_LONG, RATE, "all", np.eye(20)),
         bodies=True,
     ),
     System(
         *("pytree", _mechanical(_quadratic(), _tree), _own, _tree_force),
-        *(*_TREE, ALL, "all", np.eye(4)),
+        *(*_TREE, RATE, "all", np.eye(4)),
         bodies=True,
     ),
     System(
@@ -356,7 +357,7 @@ SYSTEMS = [
     ),
     System(
         *("force field", _mechanical(_quadratic(_MASS), dps.ForceField(_whirl))),
-        *(_inverse(_MASS), _whirl_force, *_TWO, ALL, "all", _MASS),
+        *(_inverse(_MASS), _whirl_force, *_TWO, RATE, "all", _MASS),
     ),
 ]
 
@@ -726,7 +727,15 @@ SCHEMES = [
     Scheme("RKN6", dps.BlanesMoanRKN6, 6, "nystrom"),
     Scheme("TunedRKN6", dps.TunedRKN6, 6, "nystrom"),
     Scheme("RKN8", dps.BlanesCasasRKN8, 8, "nystrom"),
-    Scheme("TunedLinear8", dps.TunedLinear8, 8, "shared"),
+    Scheme("TunedLinear8", dps.TunedLinear8, 8, "linear"),
+    Scheme(
+        *("multistep 8", lambda: dps.SymmetricMultistep(8), 8, "shared"),
+        composable=False,
+    ),
+    Scheme(
+        *("multistep 10", lambda: dps.SymmetricMultistep(10), 10, "shared"),
+        composable=False,
+    ),
     Scheme(
         *("Tao", dps.PresymplecticTao, 2, None),
         composable=False,
@@ -832,7 +841,7 @@ def offered(system: System, friction: Friction) -> frozenset[str] | Refused:
     if kind in ("place", "drag"):
         return system.offers & {"any"}
     constant = friction.constant and kind == "one rate"
-    return system.offers - (frozenset() if constant else {"shared"})
+    return system.offers - (frozenset() if constant else {"shared", "linear"})
 
 
 def claim(

@@ -51,6 +51,27 @@ MUTANTS = [
         "constant = True",
     ),
     Mutant(
+        "multistep: the history is kept where the length of a step changes",
+        "_scheme/_multistep.py",
+        "return jnp.where(same, carry.steps, 0)",
+        "return carry.steps",
+        tests="test_multistep.py",
+    ),
+    Mutant(
+        "multistep: the history starts one step too early",
+        "_scheme/_multistep.py",
+        "is_short = steps < self.order - 1",
+        "is_short = steps < self.order - 2",
+        ("multistep 8",),
+    ),
+    Mutant(
+        "multistep: the history is not carried into the frame of the end",
+        "_scheme/_multistep.py",
+        "history = map(move, (old.filter, old.force, kick))",
+        "history = old.filter, old.force, kick",
+        ("multistep 8", "constant"),
+    ),
+    Mutant(
         "no closed form of the logarithm",
         "_friction/_log_scale.py",
         "return Effect(expm1(-rate * x), carried, responded)",

@@ -1,5 +1,6 @@
 """The loop for steps that are known beforehand, as an adjoint of Diffrax."""
 
+import dataclasses
 from typing import Literal
 
 import diffrax as dfx
@@ -42,21 +43,22 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     time rounding errors grow by $e^{\eta(t_1) - \eta(t_0)}$. So states are kept along
     the way, more with more damping, from which the backward pass restarts. The error of
     the recomputed states is measured at each kept state, and one beyond `tol` raises an
-    error. By `gradient="checkpoints"` the steps between kept states are computed again
-    instead; the memory then grows with the square root of the number of steps. For
+    error. By `gradient="checkpoints"`, and for schemes without an inverse, the steps
+    between kept states are computed again instead; the memory then grows with the
+    square root of the number of steps. For
     second derivatives use forward mode over reverse mode, `jax.jvp` of `jax.grad`; for
     forward mode alone `diffrax.ForwardMode()`.
     """
 
-    gradient: Literal["reversal", "checkpoints"] = "reversal"
+    gradient: Literal["reversal", "checkpoints"] | None = None
     checkpoints: int | None = None
     tol: float | None = None
 
     def __check_init__(self):
-        if self.gradient not in ("reversal", "checkpoints"):
+        if self.gradient not in (None, "reversal", "checkpoints"):
             raise ValueError(
-                '`FixedStepAdjoint(gradient=...)` must be "reversal" or "checkpoints", '
-                f"but got {self.gradient!r}."
+                '`FixedStepAdjoint(gradient=...)` must be "reversal", "checkpoints" or '
+                f"`None`, but got {self.gradient!r}."
             )
         number = self.checkpoints
         if number is not None and (type(number) is not int or number < 0):
@@ -92,10 +94,13 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         unsupported = event, saveat.dense, passed_controller_state
         _check(solver, stepsize_controller, *unsupported)
         scheme = solver.scheme(system)
-        if self.gradient == "reversal" and not scheme.is_invertible:
+        gradient = self.gradient
+        if gradient is None:
+            gradient = "reversal" if scheme.is_invertible else "checkpoints"
+        elif gradient == "reversal" and not scheme.is_invertible:
             raise ValueError(
                 f"A step of `{type(solver).__name__}` has no known inverse. Write "
-                '`FixedStepAdjoint("checkpoints")`.'
+                "`FixedStepAdjoint()`, which takes its gradient by checkpoints."
             )
         if made_jump is not False:
             # The solver state is stale, and is recomputed before the first step.
@@ -119,14 +124,15 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
             progress_meter,
             private.meter_of(init_state),
         )
-        final = _final_state(problem, self, init_state, structure)
+        adjoint = dataclasses.replace(self, gradient=gradient)
+        final = _final_state(problem, adjoint, init_state, structure)
         return final, {"order": solver.order(terms)}
 
 
 FixedStepAdjoint.__init__.__doc__ = r"""**Arguments:**
 
-- `gradient`: `"reversal"` (the default), by running the scheme backwards, or
-    `"checkpoints"`, by computing steps again.
+- `gradient`: `"reversal"`, by running the scheme backwards, or `"checkpoints"`, by
+    computing steps again. Defaults to `None`: by reversal if the scheme has an inverse.
 - `checkpoints`: the maximum number of states to keep besides the two ends, which
     determines the memory. Defaults to `None`: for reversal 128, enough for an increment
     of $\eta$ of 1000 in `float64`, and of a few hundred in `float32`; for checkpoints

@@ -33,7 +33,8 @@ def kept_steps(adjoint: Any, problem: Problem) -> tuple[Array, Any]:
             raise ValueError(
                 'A gradient by `FixedStepAdjoint("checkpoints")` needs to know how '
                 "many steps to allocate memory for. Pass `diffeqsolve(..., "
-                'max_steps=...)`, or use `FixedStepAdjoint("reversal")`.'
+                'max_steps=...)`, or use `FixedStepAdjoint("reversal")` if the scheme '
+                "has an inverse."
             )
         number = adjoint.checkpoints
         parts = math.isqrt(most) if number is None else number + 1

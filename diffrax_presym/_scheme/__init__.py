@@ -11,6 +11,7 @@ from ._frozen import (
     PresymplecticLeapfrog as PresymplecticLeapfrog,
 )
 from ._gauss import PresymplecticGauss as PresymplecticGauss
+from ._multistep import SymmetricMultistep as SymmetricMultistep
 from ._splitting import (
     BlanesCasasRKN8 as BlanesCasasRKN8,
     BlanesMoan4 as BlanesMoan4,

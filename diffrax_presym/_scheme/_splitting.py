@@ -62,7 +62,7 @@ class AbstractSplitting(AbstractPresymplecticSolver):
             start = Kick(kind, order, known=True)
             moves = [start, *moves, inverse(start)]
             spans = [(0, 0, kicks[0]), *spans, (1, 1, kicks[-1])]
-        if kind == "shared":
+        if kind == "linear":
             enter = Enter()
             moves = [enter, *moves, inverse(enter)]
             spans = [(0, 0, 0), *spans, (1, 1, 0)]
@@ -79,7 +79,7 @@ class AbstractSplitting(AbstractPresymplecticSolver):
 def first_force(system: System, kind: str, t: Array, y: State) -> PyTree:
     """The force with which a scheme that starts with a kick starts."""
     split = system.split(kind)
-    return split.force(system, t, split.enter(system, t, y) if kind == "shared" else y)
+    return split.force(system, t, split.enter(system, t, y) if kind == "linear" else y)
 
 
 def find_split(
@@ -90,6 +90,13 @@ def find_split(
     if split is not None:
         return split
     if kind == "shared":
+        raise ValueError(
+            f"`{name}` keeps its order only for a constant mass and at most one rate "
+            "of constant friction. Write `MechanicalSystem(QuadraticKinetic(mass), "
+            "potential, ConstantDamping(rate))`; otherwise use `TunedRKN6()`, "
+            "`BlanesMoan6()` or `PresymplecticGauss()`."
+        )
+    if kind == "linear":
         raise ValueError(
             f"`{name}` keeps its order only for a linear force and at most one rate of "
             "constant friction. Write `MechanicalSystem(QuadraticKinetic(mass), "

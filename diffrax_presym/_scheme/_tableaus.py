@@ -15,7 +15,7 @@ class SplittingTableau(NamedTuple):
     order: int
     kick_first: bool
     # The kind of split that the order requires: "any", "nystrom" for a quadratic
-    # kinetic energy or potential, or "shared".
+    # kinetic energy or potential, or "linear".
     kind: str
     fractions: tuple[float, ...]
 
@@ -134,7 +134,7 @@ BLANES_CASAS_RKN_8 = SplittingTableau(
 TUNED_LINEAR_8 = SplittingTableau(
     order=8,
     kick_first=True,
-    kind="shared",
+    kind="linear",
     fractions=mirror(
         0.029932462682248132029853472991404901908,
         0.11596739049950840548665356472999082419,

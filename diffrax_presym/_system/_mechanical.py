@@ -159,13 +159,15 @@ class MechanicalSystem(AbstractSystem):
         nystrom = {"nystrom"} if kinetic.is_quadratic else set()
         kinds = frozenset({"separable", "any"} | nystrom)
         splits: list[AbstractSplit] = [KineticSplit(kinds)]
+        shared = {"shared"}
         if isinstance(self.potential, QuadraticPotential):
             splits.append(PotentialSplit())
-            constant = all(part.log_scale.is_autonomous for part in parts.linear)
-            # Other energies quadratic in `p` may have a mass that depends on time.
-            known = isinstance(kinetic, QuadraticKinetic)
-            if known and constant and has_one_rate(parts):
-                splits.append(SharedSplit())
+            shared.add("linear")
+        constant = all(part.log_scale.is_autonomous for part in parts.linear)
+        # Other energies quadratic in `p` may have a mass that depends on time.
+        known = isinstance(kinetic, QuadraticKinetic)
+        if known and constant and has_one_rate(parts):
+            splits.append(SharedSplit(frozenset(shared)))
         return tuple(splits)
 
     @property

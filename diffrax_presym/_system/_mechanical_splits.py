@@ -118,15 +118,16 @@ class PotentialSplit(AbstractSplit):
 
 
 class SharedSplit(AbstractSplit):
-    r"""Of a linear force and friction at one constant rate: half of the friction on
-    positions and half on momenta, which leaves a linear force.
+    r"""Of friction at one constant rate: half of it on positions and half on momenta,
+    which leaves a force.
 
-    With $q = e^{-\gamma t / 2} x$ the motion is $M x'' = -K x + \gamma^2 M x / 4$. The
-    pair is $q$ and $p + \gamma M q / 2$, which are $e^{-\gamma t / 2}$ times $x$ and
-    $M x'$; `enter` and `leave` go from $(q, p)$ to it and back.
+    With $q = e^{-\gamma t / 2} x$ the motion is
+    $M x'' = e^{\gamma t / 2} F + \gamma^2 M x / 4$. The pair is $q$ and
+    $p + \gamma M q / 2$, which are $e^{-\gamma t / 2}$ times $x$ and $M x'$; `enter`
+    and `leave` go from $(q, p)$ to it and back.
     """
 
-    kinds: frozenset[str] = eqx.field(static=True, default=frozenset({"shared"}))
+    kinds: frozenset[str] = eqx.field(static=True)
 
     def _shift(self, system: "System", t: Time, y: State, sign: float) -> State:
         law = system.one_rate

@@ -37,7 +37,7 @@ ts = jnp.linspace(0.0, 200.0, 21)
 @jax.jit
 def solve(dt0):
     return dfx.diffeqsolve(
-        *(system, dps.BlanesCasasRKN8(), 0.0, 200.0, dt0),
+        *(system, dps.SymmetricMultistep(10), 0.0, 200.0, dt0),
         (jnp.asarray(places), jnp.asarray(velocities)),
         saveat=dfx.SaveAt(ts=ts),
         adjoint=dps.FixedStepAdjoint(),

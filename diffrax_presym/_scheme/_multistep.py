@@ -1,0 +1,237 @@
+"""Symmetric multistep methods."""
+
+import operator
+from typing import NamedTuple
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Inexact, PyTree
+
+from .. import _tree as tree
+from .._compositions import mirror
+from .._numbers import cast_to, State
+from .._system._bound import System
+from ._base import AbstractPresymplecticSolver, Scheme
+from ._engine import AbstractMove, forward, Outcome, prepare, Span, Stage
+from ._splitting import BlanesCasasRKN8, find_split
+
+
+class MultistepTable(NamedTuple):
+    r"""A method as a filter of forces, in the order from the newest to the oldest.
+
+    $\rho(z) = (z - 1)^2 R(z)$, so that a step is a kick and a drift, with a kick $a_n$
+    that is a filtered force: $\sum_i R_i a_{n-i} = \sum_i \sigma_{i+1} g_{n-i}$.
+    """
+
+    forces: tuple[float, ...]  # sigma, without its two zeros
+    kicks: tuple[float, ...]  # R
+    # The momentum at a step less its mean over the step, divided by the length of the
+    # step: from the state of the filter and the newest force.
+    momentum: tuple[float, ...]
+
+
+# `benchmarks/multistep.py`. Few steps resonate or are unstable on Kepler orbits.
+_TABLES = {
+    8: MultistepTable(
+        mirror(
+            *(1.526021262639387, -0.9721002873134881),
+            *(5.67654076170947, -3.226897119550738),
+        ),
+        mirror(1.0, 0.9931, 1.78042878, 1.68696879452),
+        (
+            -0.011430731336082377,
+            *mirror(0.16305503063921867, 0.12675577521022127, 0.14679720288248382),
+            0.30673520799443355,
+        ),
+    ),
+    10: MultistepTable(
+        mirror(
+            *(1.601815111786648, -2.828109681370836, 9.31132817790303),
+            *(-13.412873894912394, 18.154766233313925),
+        ),
+        mirror(1.0, 0.2082, 1.21238771, 0.660218827938, 1.3374725842508208),
+        (
+            0.04898943780758026,
+            *mirror(
+                *(0.179202501435868, 0.16024525694963412),
+                *(0.16746384302176753, 0.1627823110573822),
+            ),
+            0.2952298626462146,
+        ),
+    ),
+}
+# The scheme of the first steps, and of steps of another length.
+_ONE_STEP = BlanesCasasRKN8()
+
+
+class _Carry(NamedTuple):
+    """The solver state: the history, in the frame of the end of the last step."""
+
+    steps: Inexact[Array, ""]  # of one length so far; a float, as all leaves are
+    h: Inexact[Array, ""]  # that length, zero if there was no step
+    momentum: PyTree  # the mean over the last step
+    force: PyTree
+    filter: PyTree[Inexact[Array, "lags ..."]]  # the state of the filter of forces
+
+
+class Multistep(AbstractMove):
+    """A step of the method, or of the one-step scheme if the history is too short."""
+
+    order: int = eqx.field(static=True)
+
+    def prepare(self, system: System, span: Span) -> PyTree:
+        decay = system.split("shared").prepare(system, span.t0, span.h, self.order)
+        return decay, prepare(_ONE_STEP.scheme(system).moves, system, span)
+
+    def apply(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+        (y, old), (t0, t1, h), table = stage, span, _TABLES[self.order]
+        (decay, data), split = data, system.split("shared")
+        # From the frame of the start of the step to that of its end.
+        move = lambda x: x if decay is None else tree.add(x, decay, x)
+        steps = _steps(span, old)
+        is_short = steps < self.order - 1
+
+        def one_step(y: State) -> tuple[PyTree, PyTree]:
+            """The kick that takes the position where a step of the other scheme takes
+            it, and the change of the momentum in that."""
+            moves = _ONE_STEP.scheme(system).moves
+            (end, _), _ = forward(moves, system, span, data, (y, None))
+            free, _ = split.drift(system, t0, h, decay, (y[0], old.momentum))
+            kick = system.term.kinetic.momentum(tree.sub(end[0], free))
+            return tree.scale(1 / (h * h * move(1.0)), kick), tree.sub(end[1], y[1])
+
+        # A batch computes it if one of its members needs it.
+        zeros = lambda y: (tree.zeros(y[1]), tree.zeros(y[1]))
+        kick, gained = lax.cond(eqxi.unvmap_any(is_short), one_step, zeros, y)
+        add = lambda s, f: s[0] + table.forces[0] * f
+        kick = tree.where(is_short, kick, jtu.tree_map(add, old.filter, old.force))
+        z = system.add((y[0], old.momentum), (None, tree.scale(h, kick)))
+        q, momentum = split.drift(system, t0, h, decay, z)
+
+        def remember(s, force, kick):
+            later = jnp.concatenate([s[1:], jnp.zeros_like(s[:1])])
+            return later + _outer(table.forces, force) - _outer(table.kicks, kick)
+
+        history = map(move, (old.filter, old.force, kick))
+        filter = jtu.tree_map(remember, *history)
+        force = split.force(system, t1, (q, momentum))
+        weigh = lambda s, f: sum(map(operator.mul, table.momentum, (*s, f)))
+        end = tree.add(tree.values(momentum), h, jtu.tree_map(weigh, filter, force))
+        _, end = split.leave(system, t1, (tree.values(q), end))
+        change = tree.where(is_short, gained, tree.sub(end, tree.values(y[1])))
+        _, p = system.add(y, (None, change))
+        new = _Carry(steps + 1, cast_to(h, old.h), momentum, force, filter)
+        return ((q, p), new), None
+
+    def undo(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+        raise NotImplementedError  # The history before a change of length is lost.
+
+
+def _outer(column: tuple[float, ...], x: Array) -> Array:
+    """All but the first of a column, times an array."""
+    return cast_to(np.array(column[1:]), x).reshape(-1, *(1,) * x.ndim) * x[None]
+
+
+def _steps(span: Span, carry: _Carry) -> Array:
+    """How many steps had the length of this one, but for the rounding of times."""
+    h = jnp.abs(span.h)
+    largest = jnp.abs(span.t0) + h * carry.steps
+    rounding = 8 * jnp.finfo(h.dtype).eps * largest
+    same = jnp.abs(span.h - carry.h) <= jnp.minimum(rounding, 1e-3 * h)
+    return jnp.where(same, carry.steps, 0)
+
+
+class SymmetricMultistep(AbstractPresymplecticSolver):
+    r"""A symmetric multistep method: high order with one force evaluation per step.
+
+    8th or 10th order. One force evaluation per step. An output between two steps is a
+    step of [`diffrax_presym.BlanesCasasRKN8`][], of 19 evaluations, so that dense/ts
+    output in Diffrax's loop takes seven of these in each step. Save at ends of steps.
+
+    For a [`diffrax_presym.QuadraticKinetic`][], any potential and at most one constant
+    rate of friction, with steps of one length, at errors of 1e-6 and less: where the
+    force is most of the cost and no frequency is much higher than the others, as for
+    planets and molecules. Not for stiff springs next to soft ones, strong friction, or
+    few unknowns, for which [`diffrax_presym.TunedRKN6`][] is faster.
+
+    Symmetric, but not symplectic: the error in the energy stays small over long times
+    if the motion is regular and the step is short enough (Hairer, Lubich and Wanner,
+    chapter XV). At some steps the method is unstable or resonates with the motion:
+    halve the step to see whether an error is that of the scheme.
+
+    In the frame that positions and momenta share, $q = e^{-\gamma t / 2} x$, a step is
+    a kick by a filtered force and a drift. It is the method
+    $\sum_j \alpha_j x_{n+j} = h^2 \sum_j \beta_j x''_{n+j}$ written for increments. The
+    momentum at a step is computed from the same history, and is not fed back.
+
+    The first `order - 1` steps, and as many after a jump or a change of the length of
+    the steps, are steps of [`diffrax_presym.BlanesCasasRKN8`][]. A step has no inverse:
+    [`diffrax_presym.FixedStepAdjoint`][] takes the gradient by checkpoints.
+
+    ??? cite "Reference"
+
+        ```bibtex
+        @article{quinlan1990symmetric,
+            author={Quinlan, Gerald D. and Tremaine, Scott},
+            title={Symmetric multistep methods for the numerical integration of
+                planetary orbits}, journal={The Astronomical Journal}, volume={100},
+            number={5}, pages={1694--1700}, year={1990}}
+        @misc{quinlan1999resonances,
+            author={Quinlan, Gerald D.},
+            title={Resonances and instabilities in symmetric multistep methods},
+            year={1999}, eprint={astro-ph/9901136}, archivePrefix={arXiv}}
+        ```
+    """
+
+    multistep_order: int = eqx.field(static=True)
+
+    def __init__(self, order: int = 8):
+        """**Arguments:**
+
+        - `order`: 8 or 10. Defaults to 8, which allows the longest steps; with 80 steps
+            or more to the shortest period, 10 is more accurate. The coefficients are of
+            this package, `benchmarks/multistep.py`.
+
+        **Raises:**
+
+        `ValueError` if the order is not one of these, and when the solve is traced if
+        the mass is not constant or friction is not at one constant rate.
+        """
+        if type(order) is not int or order not in _TABLES:
+            raise ValueError(
+                f"`SymmetricMultistep(order)` must be 8 or 10, but got {order!r}. At "
+                "other orders use `BlanesMoanRKN4()` or `TunedRKN6()`."
+            )
+        self.multistep_order = order
+
+    @property
+    def is_symmetric(self) -> bool:
+        return True
+
+    def order(self, terms) -> int:
+        return self.multistep_order
+
+    def scheme(self, system: System) -> Scheme:
+        find_split(self, "shared", system)
+
+        def start(system: System, t: Array, y: State) -> _Carry:
+            zero, lags = jnp.zeros((), jnp.result_type(t)), self.multistep_order - 2
+            none = tree.zeros(y[1])
+            many = jtu.tree_map(lambda x: jnp.zeros((lags, *x.shape), x.dtype), none)
+            momentum = jtu.tree_map(jnp.zeros_like, y[1])
+            return _Carry(zero, zero, momentum, none, many)
+
+        return Scheme(
+            Multistep(self.multistep_order),
+            start=start,
+            is_invertible=False,
+            not_composable=(
+                "Compositions of unequal steps are not possible with "
+                "`SymmetricMultistep`, which needs steps of one length. Compose "
+                "`PresymplecticLeapfrog()` instead."
+            ),
+        )

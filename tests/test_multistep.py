@@ -1,0 +1,299 @@
+"""Symmetric multistep methods."""
+
+import pathlib
+import sys
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from helpers import assert_close, henon_heiles, pendulum, solve
+
+import diffrax_presym as dps
+from diffrax_presym._scheme._multistep import _TABLES
+
+
+ORDERS = tuple(_TABLES)
+FIXED = dps.FixedStepAdjoint()
+
+
+def driven(t, q, args):
+    """A potential that depends on time, and on a parameter."""
+    return args * jnp.sum(1 - jnp.cos(q)) + jnp.cos(t) * q[0] * q[1] / 10
+
+
+def system(rate):
+    mass = dps.QuadraticKinetic(jnp.array([1.0, 2.0]))
+    friction = None if rate is None else dps.ConstantDamping(rate)
+    return dps.MechanicalSystem(mass, driven, friction)
+
+
+Y0 = (jnp.array([1.0, -0.5]), jnp.array([0.2, 0.4]))
+ONE = jnp.array(1.0)
+# An integrator of another kind.
+EXACT = dps.SofroniouSpaletta(10)
+
+
+def ends(*args, **options) -> Any:
+    """What a solve saves, by default the final state."""
+    return solve(*args, **options).ys
+
+
+def largest(x, y):
+    pairs = zip(*map(jax.device_get, map(jax.tree.leaves, (x, y))), strict=True)
+    return max(float(np.max(np.abs(a - b))) for a, b in pairs)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_coefficients(order, monkeypatch):
+    # For x = t^k: sum alpha_j j^k = k (k - 1) sum beta_j j^(k - 2).
+    table = _TABLES[order]
+    alpha = np.convolve(table.kicks, [1, -2, 1])
+    beta = np.array([0, *table.forces, 0])
+    j = np.arange(order + 1) - order / 2
+    defects = [
+        abs(alpha @ j**k - k * (k - 1) * (beta @ j ** max(k - 2, 0))) / (order / 2) ** k
+        for k in range(order + 3)
+    ]
+    assert max(defects[:-1]) < 1e-11 < 1e-4 < defects[-1]
+    # All roots but the double one at 1 are simple and on the unit circle.
+    roots = np.roots(table.kicks)
+    assert np.allclose(np.abs(roots), 1, atol=1e-10)
+    assert np.min(np.abs(roots - 1)) > 0.1
+    assert np.min(np.abs(roots[:, None] - roots) + 2 * np.eye(order - 2)) > 0.02
+    # The script of the coefficients still finds them.
+    folder = pathlib.Path(__file__).parents[1] / "benchmarks"
+    monkeypatch.syspath_prepend(str(folder))
+    import multistep  # pyright: ignore[reportMissingImports]
+
+    assert table == multistep.method(multistep.from_cosines(multistep.COSINES[order]))
+    for name in ("multistep", "_report"):
+        sys.modules.pop(name)
+
+
+@pytest.mark.parametrize("order, rate", [(8, None), (8, -0.1), (10, None), (10, 0.2)])
+def test_order(order, rate):
+    hamiltonian, solver = system(rate), dps.SymmetricMultistep(order)
+    assert solver.order(None) == order
+    exact = ends(hamiltonian, EXACT, 1.0, 13.0, 0.05, Y0, ONE)
+    counts = (128, 200)
+    errors = [
+        largest(ends(hamiltonian, solver, 1.0, 13.0, 12 / n, Y0, ONE), exact)
+        for n in counts
+    ]
+    measured = np.log(errors[0] / errors[1]) / np.log(counts[1] / counts[0])
+    assert measured > order - 1
+    assert errors[0] < 1e-7 and errors[1] < 3e-9
+
+
+@pytest.mark.parametrize("wrap", [lambda x: x, dps.Compensated])
+def test_rounding(wrap):
+    """Of many steps, in single precision."""
+    dtype, solver = jnp.float32, wrap(dps.SymmetricMultistep(8))
+    y0 = jax.tree.map(lambda y: y.astype(dtype), Y0)
+    times = map(dtype, (0.0, 20.0, 20 / 2000))
+    args = *times, y0, ONE.astype(dtype)
+    options: dict = dict(adjoint=FIXED, max_steps=2001)
+    exact = ends(system(None), EXACT, 0.0, 20.0, 0.05, Y0, ONE)
+    error = largest(ends(system(None), solver, *args, **options), exact)
+    assert error < (2e-7 if isinstance(solver, dps.Compensated) else 1e-5)
+
+
+def test_backwards_in_time_and_any_mass():
+    mass = jnp.array([[2.0, 0.5], [0.5, 1.0]])
+    for kinetic in (dps.QuadraticKinetic(mass), dps.QuadraticKinetic(3.0)):
+        rate = dps.ConstantDamping(0.1)
+        hamiltonian = dps.MechanicalSystem(kinetic, henon_heiles, rate)
+        y0 = jax.tree.map(lambda x: x / 4, Y0)
+        args = hamiltonian, dps.SymmetricMultistep(8), 10.0, 4.0, -0.05, y0
+        exact = ends(hamiltonian, EXACT, *args[2:])
+        assert_close(ends(*args), exact, 1e-9)
+
+
+def test_one_evaluation_per_step():
+    count = []
+
+    def counted(t, q, args):
+        jax.debug.callback(lambda: count.append(1))
+        return -jnp.sin(q)
+
+    hamiltonian = dps.MechanicalSystem(dps.QuadraticKinetic(), dps.ForceField(counted))
+    numbers = []
+    for n in (20, 60):
+        count.clear()
+        # Not the loop of Diffrax, which prepares dense output in every step.
+        args = hamiltonian, dps.SymmetricMultistep(8), 0.0, 0.05 * n, 0.05, Y0
+        solve(*args, adjoint=FIXED)
+        jax.effects_barrier()
+        numbers.append(len(count))
+    assert numbers[1] - numbers[0] == 40
+
+
+def test_a_change_of_the_step_starts_again():
+    hamiltonian, solver = system(0.2), dps.SymmetricMultistep(10)
+    ts = jnp.concatenate([jnp.linspace(0.0, 3, 31), 3 + jnp.linspace(0, 2, 41)[1:]])
+    exact = ends(hamiltonian, EXACT, 0.0, 5.0, 0.05, Y0, ONE)
+
+    @eqx.filter_jit
+    def run(x, adjoint) -> Any:
+        y0 = jax.tree.map(lambda y: x * y, Y0)
+        args = hamiltonian, solver, 0.0, 5.0, None, y0, ONE
+        controller = dfx.StepTo(ts)
+        return dfx.diffeqsolve(*args, stepsize_controller=controller, adjoint=adjoint)
+
+    assert_close(run(1.0, FIXED).ys, exact, 1e-9)
+    # With a history that is not recomputed, the error would be of the order of one.
+    uneven = ends(hamiltonian, solver, 0.0, 5.0, 0.107, Y0, ONE)
+    assert_close(uneven, exact, 1e-9)
+    # The gradient is taken by checkpoints.
+    loss = lambda x, adjoint: jnp.sum(run(x, adjoint).ys[0] ** 2)
+    slope = jax.grad(loss)(ONE, FIXED)
+    up, down = (loss(x, FIXED) for x in (ONE + 1e-5, ONE - 1e-5))
+    assert_close(slope, (up - down) / 2e-5, 1e-8)
+    with pytest.raises(ValueError, match="no known inverse"):
+        jax.grad(loss)(ONE, dps.FixedStepAdjoint("reversal"))
+
+
+def test_steps_of_one_length_but_for_rounding():
+    """Each of 400 given times is rounded; all but the first steps are of the method."""
+    count, ts = [], jnp.linspace(1000.0, 980.0, 401)
+
+    def counted(t, q, args):
+        jax.debug.callback(lambda: count.append(1))
+        return -jnp.sin(q)
+
+    hamiltonian = dps.MechanicalSystem(dps.QuadraticKinetic(), dps.ForceField(counted))
+    args = hamiltonian, dps.SymmetricMultistep(8), ts[0], ts[-1], None, Y0
+    dfx.diffeqsolve(*args, stepsize_controller=dfx.StepTo(ts), adjoint=FIXED)
+    jax.effects_barrier()
+    assert len(count) <= 7 * 20 + 400
+
+
+def test_a_jump_starts_again():
+    def pushed(t, q, args):
+        return pendulum(t, q, args) - jnp.where(t < args, 0, 1.0) * jnp.sum(q)
+
+    rate = dps.ConstantDamping(0.1)
+    term = dps.MechanicalSystem(dps.QuadraticKinetic(), pushed, rate)
+    solver = dps.SymmetricMultistep(8)
+    h, before, after = 0.1, jnp.array(9.0), jnp.array(0.0)
+
+    @jax.jit
+    def walk(y, jump):
+        def one(state, i):
+            y, carry = state
+            t, made = i * h, jump & (i == 20)
+            args = jnp.where(i < 20, before, after)
+            y, _, _, carry, _ = solver.step(term, t, t + h, y, args, carry, made)
+            return (y, carry), None
+
+        start = y, solver.init(term, jnp.asarray(0.0), jnp.asarray(h), y, before)
+        return jax.lax.scan(one, start, jnp.arange(40).astype(float))[0][0]
+
+    last = lambda ys: jax.tree.map(lambda x: x[-1], ys)
+    half = last(ends(term, EXACT, 0.0, 2.0, 0.05, Y0, before))
+    exact = last(ends(term, EXACT, 2.0, 4.0, 0.05, half, after))
+    assert_close(walk(Y0, True), exact, 1e-8)
+    assert largest(walk(Y0, False), exact) > 1e-3
+
+
+@pytest.mark.slow
+def test_events():
+    hamiltonian, solver = system(0.2), dps.SymmetricMultistep(8)
+    cond = lambda t, y, args, **kwargs: y[0][0]
+    event = dfx.Event(cond, optx.Newton(1e-11, 1e-11))
+    sol: Any = solve(hamiltonian, solver, 0.0, 9.0, 0.05, Y0, ONE, event=event)
+    assert sol.result == dfx.RESULTS.event_occurred
+    end = ends(hamiltonian, EXACT, 0.0, sol.ts[-1], 0.05, Y0, ONE)
+    assert abs(float(end[0][-1, 0])) < 1e-9
+    assert_close(sol.ys, end, 1e-8)
+
+
+@pytest.mark.slow
+def test_between_steps_the_error_is_that_at_steps():
+    hamiltonian, solver = system(0.2), dps.SymmetricMultistep(10)
+    saveat = dfx.SaveAt(ts=jnp.linspace(1.0, 6.0, 1 + 160))
+    args = 1.0, 6.0, 0.125, Y0, ONE
+    options = dict(saveat=saveat, adjoint=FIXED)
+    exact = ends(hamiltonian, EXACT, *args, **options)
+    ys = ends(hamiltonian, solver, *args, **options)
+    for y, true in zip(ys, exact, strict=True):
+        errors = np.max(np.abs(y - true), axis=1)
+        assert np.max(errors) < 1.5 * np.max(errors[::4]) < 1e-6
+    # The same from the interpolation of Diffrax, exact at both ends.
+    slow = ends(hamiltonian, solver, *args, saveat=saveat)
+    assert_close(slow, ys, 1e-7)
+    both = dfx.SaveAt(dense=True, steps=True)
+    dense: Any = solve(hamiltonian, solver, *args, saveat=both)
+    at_ends = jax.vmap(dense.evaluate)(dense.ts[:40])
+    assert_close(at_ends, jax.tree.map(lambda x: x[:40], dense.ys), 1e-12)
+
+
+@pytest.mark.slow
+def test_within_several_steps():
+    """Saved times inside of a step that consists of fifty."""
+    base = dps.SymmetricMultistep()
+    saveat = dfx.SaveAt(ts=jnp.array([3.0, 7.5, 14.0, 20.0]))
+    options = dict(saveat=saveat, adjoint=FIXED, max_steps=None)
+    several = dps.Composition(base, (1 / 50,) * 50)
+    args = system(None), several, 0.0, 20.0, 5.0, Y0, ONE
+    exact = ends(args[0], EXACT, 0.0, 20.0, 0.05, Y0, ONE, **options)
+    assert_close(ends(*args, **options), exact, 1e-7)
+
+
+def test_vmap():
+    """Some in the batch are at the start while others are not."""
+    solver = dps.SymmetricMultistep(8)
+
+    def end(scale, t0, rate):
+        y0 = jax.tree.map(lambda x: scale * x, Y0)
+        return ends(system(rate), solver, t0, 4.0, 0.1, y0, ONE)
+
+    inputs = jnp.array([0.5, 1.0]), jnp.array([0.0, 1.5]), jnp.array([0.5, 0.2])
+    batch = jax.vmap(end)(*inputs)
+    for i in range(2):
+        one = end(*(x[i] for x in inputs))
+        assert_close(jax.tree.map(lambda x, i=i: x[i], batch), one, 1e-13)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_energy_does_not_drift(order):
+    """On an orbit of Kepler's problem."""
+    potential = lambda t, q, args: -1 / jnp.sqrt(jnp.sum(q**2))
+    hamiltonian = dps.MechanicalSystem(dps.QuadraticKinetic(), potential)
+    e, orbits = 0.2, 200
+    y0 = jnp.array([1 - e, 0.0]), jnp.array([0.0, np.sqrt((1 + e) / (1 - e))])
+    ts = jnp.linspace(0, 2 * np.pi * orbits, 10 * orbits + 1)
+    saveat = dfx.SaveAt(ts=ts, fn=lambda t, y, args: hamiltonian.energy(t, *y))
+    args = hamiltonian, dps.SymmetricMultistep(order), 0.0, ts[-1], 2 * np.pi / 113, y0
+    energies = ends(*args, saveat=saveat, max_steps=None, adjoint=FIXED)
+    # The largest error in each tenth of the time.
+    errors = np.max(np.abs(np.reshape(energies[1:] + 0.5, (10, -1))), axis=1)
+    assert errors[0] < {8: 3e-8, 10: 3e-9}[order]
+    assert errors[-1] < 2 * errors[0] + 1e-13
+
+
+def test_bad_input():
+    order: Any
+    for order in (4, 9, 12, 8.0, True):
+        with pytest.raises(ValueError, match="8 or 10"):
+            dps.SymmetricMultistep(order)
+    own, kinetic = dps.SymmetricMultistep(8), dps.QuadraticKinetic()
+    for hamiltonian in (
+        dps.MechanicalSystem(dps.RelativisticKinetic(), pendulum),
+        dps.MechanicalSystem(kinetic, pendulum, dps.LogDamping(3.0, 1.0)),
+        dps.MechanicalSystem(kinetic, pendulum, dps.ViscousDamping(jnp.eye(2))),
+        dps.Hamiltonian(lambda t, q, p, args: p @ p),
+    ):
+        with pytest.raises(ValueError, match="a constant mass and at most one rate"):
+            solve(hamiltonian, own, 0.0, 1.0, 0.1, Y0)
+    with pytest.raises(ValueError, match="unequal steps"):
+        solve(system(None), dps.Suzuki4(own), 0.0, 1.0, 0.1, Y0, ONE)
+    with pytest.raises((ValueError, RuntimeError), match="error estimate"):
+        controller = dfx.PIDController(rtol=1e-6, atol=1e-6)
+        args = system(None), own, 0.0, 1.0, 0.1, Y0, ONE
+        solve(*args, stepsize_controller=controller)
