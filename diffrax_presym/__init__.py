@@ -1,61 +1,71 @@
 """Presymplectic integrators for Diffrax."""
 
 from . import diagnostics as diagnostics, extend as extend
-from ._friction import (
+from ._friction._damping import (
     ConstantDamping as ConstantDamping,
-    Drag as Drag,
     LogDamping as LogDamping,
-    PositionDamping as PositionDamping,
     PowerDamping as PowerDamping,
+)
+from ._friction._drag import Drag as Drag
+from ._friction._viscous import (
+    PositionDamping as PositionDamping,
     ViscousDamping as ViscousDamping,
 )
-from ._loop import (
-    FixedStepAdjoint as FixedStepAdjoint,
-    StepsBetween as StepsBetween,
+from ._loop._adjoint import FixedStepAdjoint as FixedStepAdjoint
+from ._loop._steps import StepsBetween as StepsBetween
+from ._scheme._compensated import Compensated as Compensated
+from ._scheme._composition import (
+    Composition as Composition,
+    SofroniouSpaletta as SofroniouSpaletta,
+    Suzuki4 as Suzuki4,
+    SuzukiYoshida as SuzukiYoshida,
 )
-from ._scheme import (
+from ._scheme._frozen import (
+    PresymplecticEuler as PresymplecticEuler,
+    PresymplecticLeapfrog as PresymplecticLeapfrog,
+)
+from ._scheme._gauss import PresymplecticGauss as PresymplecticGauss
+from ._scheme._multistep import SymmetricMultistep as SymmetricMultistep
+from ._scheme._splitting import (
     BlanesCasasRKN8 as BlanesCasasRKN8,
     BlanesMoan4 as BlanesMoan4,
     BlanesMoan6 as BlanesMoan6,
     BlanesMoanRKN4 as BlanesMoanRKN4,
     BlanesMoanRKN6 as BlanesMoanRKN6,
-    Compensated as Compensated,
-    Composition as Composition,
-    PresymplecticEuler as PresymplecticEuler,
-    PresymplecticGauss as PresymplecticGauss,
-    PresymplecticLeapfrog as PresymplecticLeapfrog,
-    PresymplecticTao as PresymplecticTao,
-    SofroniouSpaletta as SofroniouSpaletta,
     Splitting as Splitting,
-    SplittingTableau as SplittingTableau,
     Strang as Strang,
-    Suzuki4 as Suzuki4,
-    SuzukiYoshida as SuzukiYoshida,
-    SymmetricMultistep as SymmetricMultistep,
     TunedLinear8 as TunedLinear8,
     TunedRKN6 as TunedRKN6,
 )
-from ._step_size import (
+from ._scheme._tableaus import SplittingTableau as SplittingTableau
+from ._scheme._tao import PresymplecticTao as PresymplecticTao
+from ._step_size._choose import (
     choose_step as choose_step,
     ChosenStep as ChosenStep,
-    StepDensityController as StepDensityController,
 )
-from ._system import (
-    BregmanHamiltonian as BregmanHamiltonian,
-    DissipativeHamiltonian as DissipativeHamiltonian,
+from ._step_size._density import StepDensityController as StepDensityController
+from ._system._bregman import BregmanHamiltonian as BregmanHamiltonian
+from ._system._energy import Hamiltonian as Hamiltonian
+from ._system._kinetic import (
+    QuadraticKinetic as QuadraticKinetic,
+    RelativisticKinetic as RelativisticKinetic,
+)
+from ._system._lagrangian import LagrangianSystem as LagrangianSystem
+from ._system._mechanical import MechanicalSystem as MechanicalSystem
+from ._system._mirror import (
     EntropyMirror as EntropyMirror,
     EuclideanMirror as EuclideanMirror,
-    ExponentialScaling as ExponentialScaling,
-    ForceField as ForceField,
-    Hamiltonian as Hamiltonian,
-    LagrangianSystem as LagrangianSystem,
-    MechanicalSystem as MechanicalSystem,
     MirrorMap as MirrorMap,
-    pairwise_potential as pairwise_potential,
-    PolynomialScaling as PolynomialScaling,
-    QuadraticKinetic as QuadraticKinetic,
+)
+from ._system._pairwise import pairwise_potential as pairwise_potential
+from ._system._paper import DissipativeHamiltonian as DissipativeHamiltonian
+from ._system._potential import (
+    ForceField as ForceField,
     QuadraticPotential as QuadraticPotential,
-    RelativisticKinetic as RelativisticKinetic,
+)
+from ._system._scaling import (
+    ExponentialScaling as ExponentialScaling,
+    PolynomialScaling as PolynomialScaling,
     Scaling as Scaling,
 )
 

@@ -73,10 +73,8 @@ def sub(x: PyTree, y: PyTree) -> PyTree:
     return jtu.tree_map(lambda xi, yi: xi - yi, x, y, is_leaf=is_sum)
 
 
-def scale(c: ArrayLike | None, y: PyTree) -> PyTree:
-    """`c * y`, each leaf in its own precision; `y` if `c` is `None`."""
-    if c is None:
-        return y
+def scale(c: ArrayLike, y: PyTree) -> PyTree:
+    """`c * y`, each leaf in its own precision."""
     return jtu.tree_map(lambda yi: cast_to(c, yi) * yi, y)
 
 

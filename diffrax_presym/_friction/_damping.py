@@ -49,7 +49,7 @@ class Damping(AbstractFriction):
             value = values(law)
             return jtu.tree_map(lambda x: cast_to(x, value) * value, factor)
 
-        return functools.reduce(_add, [term(*x) for x in self.terms])
+        return functools.reduce(tree.sum, [term(*x) for x in self.terms])
 
     def __call__(self, t: Time) -> Numbers:
         r"""The log scale $\eta(t)$."""
@@ -62,14 +62,6 @@ class Damping(AbstractFriction):
     def rate(self, t: Time) -> Numbers:
         r"""The rate $\eta'(t)$."""
         return self._sum(lambda law: law.rate(as_time(t)))
-
-
-def _add(x: Numbers, y: Numbers) -> Numbers:
-    """The sum, where either may be one array for all leaves of the other."""
-    is_leaf = lambda x: jtu.treedef_is_leaf(jtu.tree_structure(x))
-    if is_leaf(x):
-        return jtu.tree_map(lambda yi: x + yi, y)
-    return jtu.tree_map(lambda xi: xi + y, x) if is_leaf(y) else tree.sum(x, y)
 
 
 def as_numbers(x, name: str) -> Numbers:

@@ -21,7 +21,7 @@ from ._base import (
     Parts,
 )
 from ._damping import Damping
-from ._leaf import EntryFriction, identity, MatrixFriction
+from ._leaf import EntryFriction, MatrixFriction
 from ._linear import LinearFriction
 from ._log_scale import AbstractLogScale
 
@@ -139,7 +139,7 @@ def _as_matrix(rate: Array, like: Array) -> Array:
     if is_matrix(rate, like):
         return rate
     entries = jnp.broadcast_to(rate, jnp.shape(like))
-    return entries[..., None] * identity(entries)
+    return entries[..., None] * jnp.eye(entries.shape[-1], dtype=entries.dtype)
 
 
 def one_rate(parts: Parts) -> Damping | None:

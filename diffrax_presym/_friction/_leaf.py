@@ -113,13 +113,6 @@ class MatrixFriction(eqx.Module):
         return None
 
 
-def identity(vectors: Array) -> Array:
-    """The identity matrix for each vector over the last axis."""
-    size = vectors.shape[-1]
-    one = jnp.eye(size, dtype=vectors.dtype)
-    return jnp.broadcast_to(one, (*vectors.shape, size))
-
-
 def reduce_any(conditions: list[Bool[Array, ""] | None]) -> Bool[Array, ""] | None:
     known = [x for x in conditions if x is not None]
     return functools.reduce(jnp.logical_or, known) if known else None

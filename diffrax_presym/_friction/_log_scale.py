@@ -39,6 +39,8 @@ class AbstractLogScale(eqx.Module):
 
     # Whether the rate is constant.
     is_autonomous: eqx.AbstractClassVar[bool]
+    # The limit of the rate times the time since its singularity.
+    strength: ClassVar[float] = 0.0
 
     @abc.abstractmethod
     def __call__(self, t: Time) -> Inexact[Array, "..."]:
@@ -64,11 +66,6 @@ class AbstractLogScale(eqx.Module):
     def is_singular(self, t: Time) -> Bool[Array, ""] | None:
         """Whether the rate is infinite at `t`; `None` if it never is."""
         return None
-
-    @property
-    def strength(self) -> float:
-        """The limit of the rate times the time since its singularity."""
-        return 0.0
 
 
 Terms = Sequence[tuple[AbstractLogScale, Array]]
@@ -119,6 +116,7 @@ class Logarithm(AbstractLogScale):
     r"""$\eta(t) = \log(t + s)$."""
 
     shift: Inexact[ArrayLike, "..."] | None
+    strength: ClassVar[float] = 1.0
     is_autonomous: ClassVar[bool] = False
 
     def __call__(self, t: Time) -> Scalar:
@@ -155,10 +153,6 @@ class Logarithm(AbstractLogScale):
 
     def is_singular(self, t: Time) -> Bool[Array, ""]:
         return jnp.any(self._since(t)[0])
-
-    @property
-    def strength(self) -> float:
-        return 1.0
 
 
 class Power(AbstractLogScale):

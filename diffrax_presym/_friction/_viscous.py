@@ -90,7 +90,7 @@ def ViscousDamping(coefficients) -> ViscousFriction | LocalFriction:
     [`diffrax_presym.ConstantDamping`][]. For [`diffrax_presym.MechanicalSystem`][] with
     a kinetic energy of known mass, and [`diffrax_presym.LagrangianSystem`][]. In the
     first the flow of drift and friction is exact, by $e^{-h C M^{-1}}$ and its
-    integral, so that every scheme keeps its order. A symmetric positive matrix $C$
+    integral, so that no scheme loses its order by it. A symmetric positive matrix $C$
     damps; an antisymmetric one does no work, and the energy is kept. The force
     $e \, v \times B$ on a charge $e$ in a uniform magnetic field $B$ is
     `ViscousDamping(e * jnp.array([[0, -B[2], B[1]], [B[2], 0, -B[0]],

@@ -1,6 +1,6 @@
 """The schemes of the paper, made of two half-steps that are adjoint to each other."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 
@@ -23,11 +23,12 @@ def _momentum_first(solver, system: System, known: bool = False) -> Stages:
     return Stages([kick, FrozenDrift()], [(0, 0, 1), (0, 1, 1)])
 
 
-def _check(solver) -> None:
-    if solver.first not in ("momentum", "position"):
+def _check(first: Any) -> Any:
+    if first not in ("momentum", "position"):
         raise ValueError(
-            f'`first` must be "momentum" or "position", but got {solver.first!r}.'
+            f'`first` must be "momentum" or "position", but got {first!r}.'
         )
+    return first
 
 
 _ARGUMENTS = """**Arguments:**
@@ -56,10 +57,9 @@ class PresymplecticEuler(AbstractPresymplecticSolver):
     and Vidal (2021).
     """
 
-    first: Literal["momentum", "position"] = eqx.field(static=True, default="momentum")
-
-    def __check_init__(self):
-        _check(self)
+    first: Literal["momentum", "position"] = eqx.field(
+        static=True, default="momentum", converter=_check
+    )
 
     @property
     def is_symmetric(self) -> bool:
@@ -102,10 +102,9 @@ class PresymplecticLeapfrog(AbstractPresymplecticSolver):
     and Vidal (2021).
     """
 
-    first: Literal["momentum", "position"] = eqx.field(static=True, default="momentum")
-
-    def __check_init__(self):
-        _check(self)
+    first: Literal["momentum", "position"] = eqx.field(
+        static=True, default="momentum", converter=_check
+    )
 
     @property
     def is_symmetric(self) -> bool:

@@ -17,12 +17,6 @@ from ._base import AbstractPresymplecticSolver, Scheme
 from ._engine import AbstractMove, Outcome, Span, Stage, Stages
 
 
-def paired_field(system: System, t: Array, y: State, copy: State) -> State:
-    """Velocity and force at `q` of one copy and `p` of the other."""
-    at = (y[0], copy[1])
-    return system.velocity(t, at), system.force(t, at)
-
-
 class Exchange(AbstractMove):
     """The flow of `H(t, q, p_copy)`, equation (tao_map1), or of `H(t, q_copy, p)`, for
     the `second` copy. The field may be known, from the last exchange."""
@@ -39,7 +33,7 @@ class Exchange(AbstractMove):
     def undo(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
         y, (copy, _) = stage
         one, other = (copy, y) if self.second else (y, copy)
-        field = paired_field(system, span.t0, one, other)
+        field = system.velocity_and_force(span.t0, (one[0], other[1]))
         return self._by(field, system, span, stage), None
 
     def _by(self, field: State, system: System, span: Span, stage: Stage) -> Stage:
@@ -178,7 +172,7 @@ class PresymplecticTao(AbstractPresymplecticSolver):
             (0.5, 0.5, 1),
             *((0.5, 0.5, 0.5), (0.5, 1, 0.5), (1, 1, 0.5)),
         ]
-        start = lambda system, t, y: (y, paired_field(system, t, y, y))
+        start = lambda system, t, y: (y, system.velocity_and_force(t, y))
         not_composable = None
         if self.coupling is None:
             not_composable = (

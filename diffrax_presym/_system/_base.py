@@ -174,8 +174,17 @@ class AbstractSystem(dfx.AbstractTerm):
         return tree.scale(jnp.exp(-self.log_scale(t)), P)
 
     def from_velocity(self, t: Time, y: tuple[Q, Q], args: PyTree = None) -> State:
-        """The state `(q, p)` of positions and velocities `(q, v)`."""
-        return momentum_of(self, t, *y, args)
+        """The state `(q, p)` of positions and velocities `(q, v)`: by Newton's method
+        from the momentum that is equal to the velocity."""
+        q, v = y
+        eps = max(float(jnp.finfo(x.dtype).eps) for x in jtu.tree_leaves(v))
+        size = lax.stop_gradient(tree.largest(v))
+        # Relative to the velocity, so that the tolerance is its rounding.
+        unit = jnp.where(size > 0, 1 / size, 1)
+        miss = lambda p: tree.sub(self.velocity(t, q, p, args), v)
+        residual = lambda p, _: tree.scale(unit, miss(p))
+        finder = optx.Newton(rtol=10 * eps, atol=10 * eps)
+        return q, optx.root_find(residual, finder, v).value
 
     def to_velocity(self, t: Time, y: State, args: PyTree = None) -> tuple[Q, Q]:
         """Positions and velocities `(q, v)` of a state `(q, p)`: save them by
@@ -201,16 +210,3 @@ def check_state(y: PyTree) -> None:
                 "them with `jnp.asarray(x, float)`, a complex number to its real and "
                 "imaginary parts."
             )
-
-
-def momentum_of(system: AbstractSystem, t: Time, q: Q, v: Q, args: PyTree) -> State:
-    """The state of positions and velocities, by Newton's method from the momentum that
-    is equal to the velocity."""
-    eps = max(float(jnp.finfo(x.dtype).eps) for x in jtu.tree_leaves(v))
-    size = lax.stop_gradient(tree.largest(v))
-    # Relative to the velocity, so that the tolerance is its rounding.
-    unit = jnp.where(size > 0, 1 / size, 1)
-    miss = lambda p: tree.sub(system.velocity(t, q, p, args), v)
-    residual = lambda p, _: tree.scale(unit, miss(p))
-    finder = optx.Newton(rtol=10 * eps, atol=10 * eps)
-    return q, optx.root_find(residual, finder, v).value

@@ -9,9 +9,8 @@ import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, PyTree
 
 from .. import _tree as tree
-from .._friction._damping import Damping
 from .._friction._linear import LinearFriction
-from .._numbers import cast_to, State, Time
+from .._numbers import as_time, cast_to, State, Time
 from ._base import AbstractSystem
 
 
@@ -39,7 +38,8 @@ class System(eqx.Module):
 
     def time(self, t: ArrayLike) -> Array:
         """The physical time, which runs backwards where `direction` is -1."""
-        return jnp.asarray(t) * cast_to(self.direction, t)
+        t = as_time(t)
+        return t * cast_to(self.direction, t)
 
     # States.
 
@@ -105,11 +105,6 @@ class System(eqx.Module):
         if self.friction is None:
             return p
         return jtu.tree_map(jnp.add, p, self.friction.decay(data, p))
-
-    @property
-    def one_rate(self) -> Damping | None:
-        """The law of friction, where it is known to be one rate for all momenta."""
-        return self.term.damping
 
     # Splits.
 

@@ -6,7 +6,7 @@ import jax
 from jaxtyping import Array, Bool, PyTree
 
 from .. import _tree as tree
-from .._checks import check_callable, match, scalar_fn
+from .._checks import check_callable, scalar_fn
 from .._friction._base import AbstractFriction
 from .._numbers import Scalar, State, Time
 from ._base import AbstractSystem, P, Q
@@ -20,10 +20,6 @@ class BregmanSplit(AbstractSplit):
     objective."""
 
     kinds: frozenset[str] = eqx.field(static=True)
-
-    def __init__(self, is_quadratic: bool):
-        quadratic = {"separable", "nystrom"} if is_quadratic else set()
-        self.kinds = frozenset({"any"} | quadratic)
 
     def prepare(self, system, t, h, order) -> PyTree:
         friction: Any = system.friction  # there always is some
@@ -72,9 +68,8 @@ class BregmanHamiltonian(AbstractSystem):
     mirror_map: AbstractMirrorMap
     objective: Callable
     scaling: Scaling
-    gradient_fn: Callable | None
 
-    def __init__(self, mirror_map, objective, scaling, *, gradient=None):
+    def __init__(self, mirror_map, objective, scaling):
         r"""**Arguments:**
 
         - `mirror_map`: the mirror map $h$, for example
@@ -83,8 +78,6 @@ class BregmanHamiltonian(AbstractSystem):
             a scalar.
         - `scaling`: the functions $\alpha$, $\beta$ and $\gamma$ of time, for example
             [`diffrax_presym.PolynomialScaling`][].
-        - `gradient`: the gradient $\nabla f$, a function `gradient(t, q, args)`.
-            Defaults to automatic differentiation.
 
         **Raises:**
 
@@ -103,11 +96,9 @@ class BregmanHamiltonian(AbstractSystem):
                 f"{scaling!r}. For functions of your own write `Scaling(gamma, beta)`."
             )
         check_callable(objective, "objective", "f(t, q, args)")
-        check_callable(gradient, "gradient", "gradient(t, q, args)", optional=True)
         self.mirror_map = mirror_map
         self.objective = objective
         self.scaling = scaling
-        self.gradient_fn = gradient
 
     @property
     def laws(self) -> tuple[AbstractFriction, ...]:
@@ -115,7 +106,8 @@ class BregmanHamiltonian(AbstractSystem):
 
     @property
     def splits(self) -> tuple[AbstractSplit, ...]:
-        return (BregmanSplit(self.mirror_map.is_quadratic),)
+        quadratic = {"separable", "nystrom"} if self.mirror_map.is_quadratic else set()
+        return (BregmanSplit(frozenset({"any"} | quadratic)),)
 
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         h, step = self.mirror_map, self.mirror_map.step(q, p)
@@ -143,11 +135,8 @@ class BregmanHamiltonian(AbstractSystem):
 
     def potential_force(self, t: Time, q: Q, args: PyTree = None) -> P:
         """The force of the objective."""
-        if self.gradient_fn is None:
-            objective = scalar_fn(self.objective, "The objective")
-            slope = jax.grad(objective, argnums=1)(t, q, args)
-        else:
-            slope = match(self.gradient_fn(t, q, args), q, "`gradient`", "`q`")
+        objective = scalar_fn(self.objective, "The objective")
+        slope = jax.grad(objective, argnums=1)(t, q, args)
         return tree.scale(-self.scaling.strength(t), self.mirror_map.project(slope))
 
     def is_valid(

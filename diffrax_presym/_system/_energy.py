@@ -1,7 +1,7 @@
 from collections.abc import Callable
 
 import jax
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import PyTree
 
 from .. import _tree as tree
 from .._checks import check_callable, scalar_fn
@@ -16,10 +16,9 @@ class Hamiltonian(AbstractSystem):
     r"""Any energy $E(t, q, p)$, with friction and any other force.
 
     For energies that are not a sum $T(t, p) + V(t, q)$, which
-    [`diffrax_presym.MechanicalSystem`][] takes. Euler and leapfrog are implicit for it
-    and need a root finder; [`diffrax_presym.PresymplecticGauss`][] does not. If part of
-    its motion has a known flow, such as along Kepler's orbits, pass that as a split:
-    splittings are then explicit.
+    [`diffrax_presym.MechanicalSystem`][] takes: use
+    [`diffrax_presym.PresymplecticGauss`][]. If part of its motion has a known flow,
+    such as along Kepler's orbits, pass that as a split: splittings are then explicit.
 
     !!! warning
 
@@ -88,8 +87,3 @@ class Hamiltonian(AbstractSystem):
         slope, velocity = jax.grad(self.energy, argnums=(1, 2))(t, q, p, args)
         force, state = tree.scale(-1, slope), (t, q, p, velocity, args)
         return velocity, self.add_forces(force, self.external, *state)
-
-    def is_valid(
-        self, t: Time, q: Q, p: P, args: PyTree = None
-    ) -> Bool[Array, ""] | None:
-        return tree.all_finite((q, p))

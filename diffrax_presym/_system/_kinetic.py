@@ -37,25 +37,43 @@ class AbstractKinetic(eqx.Module):
     def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
         r"""The velocity $\partial T / \partial p$."""
 
-    @abc.abstractmethod
     def prepare(
         self, friction: LinearFriction | None, t: Time, h: Time, order: int
     ) -> PyTree:
         """What the flow from `t` to `t + h` needs of time alone, of at least the given
-        order in `h` if it is not known in closed form."""
+        order in `h` if it is not known in closed form.
 
-    @abc.abstractmethod
+        By default nodes and weights of the integral of any velocity, with the decay of
+        the momentum up to each node and to the end.
+        """
+        nodes, weights = gauss_legendre(h, order)
+        if friction is None:
+            return nodes, weights, None, None
+        each = jax.vmap(lambda s: friction.prepare(t, s, order))(nodes)
+        return nodes, weights, each, friction.prepare(t, h, order)
+
     def flow(
         self,
         friction: LinearFriction | None,
         t: Time,
         h: Time,
-        data: PyTree,
+        data: Any,
         p: PyTree,
         args: PyTree,
     ) -> tuple[PyTree, PyTree | None]:
         """The integral of the velocity from `t` to `t + h`, with only friction acting
         on `p`, and the change of `p` by it."""
+        nodes, weights, each, whole = data
+
+        def add(total, row):
+            s, weight, data = row
+            left = p if friction is None else tree.sum(p, friction.decay(data, p))
+            part = tree.scale(weight, self.velocity(t + s, left, args))
+            return tree.sum(total, part), None
+
+        rows = nodes, weights, each
+        total, _ = lax.scan(add, tree.zeros(p), rows, unroll=True)
+        return total, None if friction is None else friction.decay(whole, p)
 
     @abc.abstractmethod
     def rescale(self, s: Scalar) -> "AbstractKinetic":
@@ -176,13 +194,10 @@ class RelativisticKinetic(AbstractKinetic):
         square = tree.dot(*(tree.scale(1 / self.speed, v),) * 2)
         return tree.scale(cast_to(self.mass, square) / jnp.sqrt(1 - square), v)
 
-    def prepare(self, friction, t, h, order):
-        return prepare_quadrature(friction, t, h, order)
-
     def flow(self, friction, t, h, data, p, args):
         if friction is None:
             return tree.scale(h, self.velocity(t, p, args)), None
-        return integrate(self.velocity, friction, t, h, data, p, args)
+        return super().flow(friction, t, h, data, p, args)
 
     def rescale(self, s: Scalar) -> "RelativisticKinetic":
         speed = self.speed * cast_to(jnp.exp(-s), self.speed)
@@ -202,52 +217,12 @@ class CallableKinetic(AbstractKinetic):
     def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
         return jax.grad(scalar_fn(self.fn, "The kinetic energy"), argnums=1)(t, p, args)
 
-    def prepare(self, friction, t, h, order):
-        return prepare_quadrature(friction, t, h, order)
-
-    def flow(self, friction, t, h, data, p, args):
-        return integrate(self.velocity, friction, t, h, data, p, args)
-
     def rescale(self, s: Scalar) -> "CallableKinetic":
         def rescaled(t, p, args):
             energy = self.fn(t, tree.scale(jnp.exp(s), p), args)
             return tree.scale(jnp.exp(-2 * s), energy)
 
         return CallableKinetic(rescaled)
-
-
-def prepare_quadrature(
-    friction: LinearFriction | None, t: Time, h: Time, order: int
-) -> PyTree:
-    """The nodes and weights of the integral of a velocity, with the decay of the
-    momentum up to each node and to the end."""
-    nodes, weights = gauss_legendre(h, order)
-    if friction is None:
-        return nodes, weights, None, None
-    each = jax.vmap(lambda s: friction.prepare(t, s, order))(nodes)
-    return nodes, weights, each, friction.prepare(t, h, order)
-
-
-def integrate(
-    velocity: Callable,
-    friction: LinearFriction | None,
-    t: Time,
-    h: Time,
-    data: Any,
-    p: PyTree,
-    args: PyTree,
-) -> tuple[PyTree, PyTree | None]:
-    """The displacement under any velocity `velocity(t, p, args)`, by quadrature."""
-    nodes, weights, each, whole = data
-
-    def add(total, row):
-        s, weight, data = row
-        left = p if friction is None else tree.sum(p, friction.decay(data, p))
-        part = tree.scale(weight, velocity(t + s, left, args))
-        return tree.sum(total, part), None
-
-    total, _ = lax.scan(add, tree.zeros(p), (nodes, weights, each), unroll=True)
-    return total, None if friction is None else friction.decay(whole, p)
 
 
 def as_kinetic(kinetic) -> AbstractKinetic:

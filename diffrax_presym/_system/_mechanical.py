@@ -3,15 +3,14 @@
 from collections.abc import Callable
 
 import jax
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import PyTree
 
-from .. import _tree as tree
 from .._checks import check_callable, scalar_fn
 from .._friction._base import AbstractFriction, Mechanics
 from .._friction._damping import as_laws
 from .._friction._fit import has_one_rate
 from .._numbers import Scalar, Time
-from ._base import AbstractSystem, momentum_of, P, Q
+from ._base import AbstractSystem, P, Q
 from ._kinetic import (
     AbstractKinetic,
     as_kinetic,
@@ -40,8 +39,8 @@ class MechanicalSystem(AbstractSystem):
     | a power of the speed | [`diffrax_presym.Drag`][] |
     | any other | `force` |
 
-    The first two are linear, and exact in the drift. Every scheme of this package keeps
-    its order, and phase volume contracts exactly. With friction by place or by speed
+    The first two are linear, and exact in the drift: no scheme loses its order by them,
+    and in one-step schemes phase volume contracts exactly. With friction by place or by speed
     use [`diffrax_presym.BlanesMoan4`][] or [`diffrax_presym.BlanesMoan6`][]. A `force`
     that depends on the velocity has no exact flow: use
     [`diffrax_presym.PresymplecticGauss`][].
@@ -138,13 +137,7 @@ class MechanicalSystem(AbstractSystem):
         """The state `(q, p)` of positions and velocities `(q, v)`."""
         if isinstance(self.kinetic, QuadraticKinetic | RelativisticKinetic):
             return y[0], self.kinetic.momentum(y[1])
-        return momentum_of(self, t, *y, args)
-
-    def is_valid(
-        self, t: Time, q: Q, p: P, args: PyTree = None
-    ) -> Bool[Array, ""] | None:
-        # The flow of drag backwards in time ends after a finite time.
-        return tree.all_finite((q, p)) if self.parts.drags else None
+        return super().from_velocity(t, y, args)
 
     # The moves.
 

@@ -130,7 +130,7 @@ class SharedSplit(AbstractSplit):
     kinds: frozenset[str] = eqx.field(static=True)
 
     def _shift(self, system: "System", t: Time, y: State, sign: float) -> State:
-        law = system.one_rate
+        law = system.term.damping
         if law is None:
             return y
         shift = system.term.kinetic.momentum(tree.values(y[0]))
@@ -143,7 +143,7 @@ class SharedSplit(AbstractSplit):
         return self._shift(system, t, z, -0.5)
 
     def prepare(self, system, t, h, order) -> PyTree:
-        law = system.one_rate
+        law = system.term.damping
         return None if law is None else jnp.expm1(-law.increment(t, h) / 2)
 
     def drift(self, system, t, h, data, y) -> State:
@@ -152,7 +152,7 @@ class SharedSplit(AbstractSplit):
         return y if data is None else system.add(y, tree.scale(data, tree.values(y)))
 
     def force(self, system, t, y) -> PyTree:
-        force, law = _potential_force(system, t, y), system.one_rate
+        force, law = _potential_force(system, t, y), system.term.damping
         if law is None:
             return force
         mass = system.term.kinetic.momentum(tree.values(y[0]))

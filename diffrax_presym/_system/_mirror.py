@@ -132,7 +132,8 @@ class EntropyMirror(AbstractMirrorMap):
         return jtu.tree_map(jax.nn.softmax if self.simplex else jnp.exp, w)
 
     def contains(self, q: PyTree) -> Bool[Array, ""]:
-        return _everywhere(lambda qi: (qi > 0) & jnp.isfinite(qi), q)
+        positive = lambda q: jnp.where(q > 0, q, jnp.nan)
+        return tree.all_finite(jtu.tree_map(positive, q))
 
     def step(self, q: PyTree, p: PyTree) -> PyTree:
         def leaf(q, p):
@@ -155,21 +156,19 @@ class MirrorMap(AbstractMirrorMap):
     r"""A mirror map given by a function $h$.
 
     $\nabla h$ is by automatic differentiation. Where its inverse has no closed form,
-    let `inverse` find a root with `optimistix.root_find`.
+    let `inverse` find a root with `optimistix.root_find`. Its domain is where $h$ is
+    finite.
     """
 
     is_quadratic = False
     fn: Callable
     inverse_fn: Callable
-    domain: Callable | None
 
-    def __init__(self, h, inverse, domain=None):
+    def __init__(self, h, inverse):
         r"""**Arguments:**
 
         - `h`: a strictly convex function `h(q)` that returns a scalar.
         - `inverse`: the inverse $\nabla h^*$ of the gradient, a function `inverse(w)`.
-        - `domain`: a function `domain(q)` that returns whether `q` is inside the domain
-            of `h`. Defaults to where `h(q)` is finite.
 
         **Raises:**
 
@@ -177,10 +176,8 @@ class MirrorMap(AbstractMirrorMap):
         """
         check_callable(h, "h", "h(q)")
         check_callable(inverse, "inverse", "inverse(w)")
-        check_callable(domain, "domain", "domain(q)", optional=True)
         self.fn = h
         self.inverse_fn = inverse
-        self.domain = domain
 
     def __call__(self, q: PyTree) -> Scalar:
         return scalar_fn(self.fn, "The mirror map")(q)
@@ -192,10 +189,4 @@ class MirrorMap(AbstractMirrorMap):
         return match(self.inverse_fn(w), w, "`inverse`", "`w`")
 
     def contains(self, q: PyTree) -> Bool[Array, ""]:
-        inside = tree.all_finite(self(q)) if self.domain is None else self.domain(q)
-        return tree.all_finite(q) & jnp.all(inside)
-
-
-def _everywhere(condition: Callable, q: PyTree) -> Bool[Array, ""]:
-    held = jtu.tree_map(lambda qi: jnp.all(condition(qi)), q)
-    return jtu.tree_reduce(jnp.logical_and, held, jnp.array(True))
+        return tree.all_finite((q, self(q)))

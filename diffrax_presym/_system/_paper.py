@@ -13,12 +13,7 @@ from .._friction._damping import as_laws, ConstantDamping, Damping
 from .._friction._fit import fit_friction, one_rate
 from .._friction._linear import LinearFriction
 from .._numbers import as_time, Scalar, Time
-from ._kinetic import (
-    AbstractKinetic,
-    as_kinetic,
-    integrate,
-    prepare_quadrature,
-)
+from ._kinetic import AbstractKinetic, as_kinetic
 from ._mechanical import MechanicalSystem
 
 
@@ -105,7 +100,7 @@ class _ScaledKinetic(AbstractKinetic):
 
     def prepare(self, friction, t, h, order):
         if not self.is_quadratic:
-            return prepare_quadrature(friction, t, h, order)
+            return super().prepare(friction, t, h, order)
         assert friction is not None
         # exp(eta2 - eta1) times the decay of p, exp(-eta2), decays like exp(-eta1).
         displacement = self._by_eta1(jnp.zeros_like(h)).prepare(t, h, order)
@@ -113,7 +108,7 @@ class _ScaledKinetic(AbstractKinetic):
 
     def flow(self, friction: Any, t, h, data, p, args):
         if not self.is_quadratic:
-            return integrate(self.velocity, friction, t, h, data, p, args)
+            return super().flow(friction, t, h, data, p, args)
         scale, displacement, decay = data
         carried = scale * displacement.leaves.carried
         dq = self.kinetic.velocity(t, tree.scale(carried, p), args)

@@ -7,7 +7,8 @@ A system lists the splits that it allows, and a scheme needs one by kind:
   the other part, at fixed time;
 - `"nystrom"`: as any, and the part that drifts is quadratic, so that the commutator
   [kick, [kick, [kick, drift]]] vanishes, as Runge--Kutta--Nyström methods require;
-- `"shared"`: constant mass and friction, turned into a force; `"linear"`: a linear one.
+- `"shared"`: constant friction turned into a force, for a constant mass;
+- `"linear"`: as shared, and the force is linear in the positions.
 
 What a drift needs of time alone is prepared, for all stages of a step at once.
 """
