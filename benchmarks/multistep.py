@@ -3,8 +3,8 @@
 The table is the end of the interval of stability on an oscillator and, on Kepler
 orbits, the number of steps to an orbit at which the energy drifts, of those tried, with
 the energy error at some of them. `--search` chose the roots of `rho` among random ones,
-by the number of steps at which it drifts, and then by the error; Kepler orbits are in
-the half of the problems to tune on. `method` has the coefficients of the package.
+by the number of steps at which it drifts, and then by the error, on other orbits and at
+other numbers of steps; Kepler orbits are in the half of the problems to tune on.
 """
 
 import math
@@ -28,9 +28,9 @@ PUBLISHED = {
     "order 10, Quinlan and Tremaine": (1, -1, 1, -1, 1, -2),
     "order 12, Quinlan and Tremaine": (1, -2, 2, -1, 0, 0, 0),
 }
-# Steps to an orbit, without simple ratios to angles of roots.
-STEPS = np.round(1.0137 * np.geomspace(40, 170, 24), 1)
-SHOWN = (4, 12, 20)
+# Steps to an orbit, and eccentricities: of the search, and of the table.
+SEARCH = np.round(1.0137 * np.geomspace(40, 170, 24), 1), (0.1, 0.3)
+TABLE = np.round(np.geomspace(41, 173, 60), 1), (0.2, 0.4)
 fractions = np.vectorize(Fraction, otypes=[object])
 force = lambda q: -q / np.sum(q**2, axis=-1, keepdims=True) ** 1.5
 
@@ -133,23 +133,23 @@ def energy_errors(method, e, steps, orbits=60):
     return errors
 
 
-def tried(rho, steps):
-    """Errors at eccentricities 0.1 and 0.3, and for how many steps they drift."""
-    errors = [energy_errors(method(rho), e, steps) for e in (0.1, 0.3)]
+def tried(rho, steps, eccentricities):
+    """Errors on two orbits, and for how many numbers of steps they drift."""
+    errors = [energy_errors(method(rho), e, steps) for e in eccentricities]
     grows = lambda x: (x[3] > 3 * np.maximum(x[0], 1e-15)) & (x[3] > 1e-11)
     return errors, [int(np.sum((x[3] > 1e-3) | grows(x))) for x in errors]
 
 
-def resonances(steps):
-    shown = [f"{steps[i]:.0f} steps:>9.1e" for i in SHOWN if i < len(steps)]
-    columns = "stable to:>9.2f", "drift, e = 0.1:>15", "e = 0.3:>8"
+def resonances(steps, eccentricities):
+    shown = [f"{steps[i]:.0f} steps:>9.1e" for i in range(12, len(steps), 20)]
+    columns = "stable to:>9.2f", *(f"drift, e = {e}:>15" for e in eccentricities)
     table = Table("Methods on Kepler orbits", "method:<31", *columns, *shown)
     methods = {f"order {n}": from_cosines(COSINES[n]) for n in COSINES}
     methods |= {name: (*rho, *rho[-2::-1]) for name, rho in PUBLISHED.items()}
     for name, rho in sorted(methods.items(), key=lambda x: len(x[1])):
-        errors, drifts = tried(rho, steps)
+        errors, drifts = tried(rho, steps, eccentricities)
         counts = [f"{n} of {len(steps)}" for n in drifts]
-        last = [errors[1][3][i] for i in SHOWN if i < len(steps)]
+        last = [errors[0][3][i] for i in range(12, len(steps), 20)]
         table.row(name, stability_limit(method(rho)), *counts, *last)
 
 
@@ -161,7 +161,7 @@ def search(order, number):
         angles = np.linspace(*ends, pairs) + rng.uniform(-0.04, 0.04, pairs)
         angles = np.sort(angles)
         if np.min(np.diff(angles)) >= 0.09 and angles[-1] <= 0.97:
-            errors, drifts = tried(from_cosines(2 * np.cos(np.pi * angles)), STEPS)
+            errors, drifts = tried(from_cosines(2 * np.cos(np.pi * angles)), *SEARCH)
             size = np.mean(np.log10(np.minimum([x[3] for x in errors], 1)))
             found.append((sum(drifts), size, angles))
     table = Table("", "roots / pi:<36", "drifts:>6", "log10 error:>11.2f")
@@ -175,7 +175,7 @@ def main():
     options = parser.parse_args()
     if options.search:
         return search(options.search, 4 if options.quick else 40)
-    return resonances(STEPS[:: 6 if options.quick else 1])
+    return resonances(TABLE[0][:: 6 if options.quick else 1], TABLE[1])
 
 
 if __name__ == "__main__":

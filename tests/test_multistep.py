@@ -103,6 +103,53 @@ def test_rounding(wrap):
     assert error < (2e-7 if isinstance(solver, dps.Compensated) else 1e-5)
 
 
+def test_rounding_far_from_the_origin():
+    """The start takes differences of positions, in single precision."""
+    spring = lambda t, q, args: jnp.sum((q - 1000) ** 2) / 2
+    hamiltonian = dps.MechanicalSystem(dps.QuadraticKinetic(), spring)
+    y0 = jnp.full(1, 1000, jnp.float32), jnp.ones(1, jnp.float32)
+    times = map(jnp.float32, (0.0, 2.0, 0.02))
+    _, p = ends(hamiltonian, dps.SymmetricMultistep(8), *times, y0, adjoint=FIXED)
+    assert abs(float(p[-1, 0]) - np.cos(2.0)) < 3e-4
+
+
+def test_a_step_that_changes_slowly():
+    """In single precision a change may be as small as the rounding of times."""
+    ts = jnp.float32(100 + np.cumsum(np.r_[0, 0.1 * 1.0005 ** np.arange(400)]))
+    y0 = jax.tree.map(jnp.float32, Y0)
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), henon_heiles)
+    y0 = jax.tree.map(lambda y: y / 4, y0)
+    solve = lambda solver: dfx.diffeqsolve(
+        *(system, solver, ts[0], ts[-1], None, y0),
+        stepsize_controller=dfx.StepTo(ts),
+        adjoint=FIXED,
+    )
+    both = [solve(x).ys for x in (dps.SymmetricMultistep(8), dps.BlanesCasasRKN8())]
+    assert largest(*both) < 1e-3
+
+
+@pytest.mark.parametrize("adjoint", [FIXED, dfx.RecursiveCheckpointAdjoint()])
+def test_kinks_at_equal_distances(adjoint):
+    """Steps of one length all along, but the history ends at each kink."""
+    times = jnp.arange(9.0)
+    forces = jnp.array([0.0, 1, -1, 2, 0, -2, 1, 0, 1])
+    force = lambda t, q, args: jnp.interp(t, times, forces) - jnp.sin(q)
+    term = dps.MechanicalSystem(dps.QuadraticKinetic(), dps.ForceField(force))
+    options: dict = dict(stepsize_controller=dps.StepsBetween(times), adjoint=adjoint)
+    run = lambda solver: dfx.diffeqsolve(term, solver, 0.0, 8.0, 0.05, Y0, **options)
+    if adjoint is FIXED:
+        with pytest.raises(ValueError, match="the history of"):
+            run(dps.SymmetricMultistep())
+    else:
+        assert_close(run(dps.SymmetricMultistep()).ys, run(EXACT).ys, 1e-8)
+
+
+def test_what_one_step_does_not_show():
+    args = 0.0, 0.1, Y0, ONE
+    with pytest.raises(ValueError, match="not symplectic"):
+        dps.diagnostics.structure_defect(system(0.1), dps.SymmetricMultistep(), *args)
+
+
 def test_backwards_in_time_and_any_mass():
     mass = jnp.array([[2.0, 0.5], [0.5, 1.0]])
     for kinetic in (dps.QuadraticKinetic(mass), dps.QuadraticKinetic(3.0)):

@@ -283,7 +283,8 @@ def check(row: dict):
     assert not isinstance(claimed, Refused)
     if way.name not in LATE and friction.limit is not None:
         claimed = min(claimed, 1)  # within the first step after a singular start
-    if way.name == "unequal steps" and scheme.name.startswith("multistep"):
+    vary = way.name in ("unequal steps", "step density")
+    if vary and scheme.name.startswith("multistep"):
         claimed = min(claimed, 8)  # all steps are those of the start
     run = Run(row, row["gradient"].adjoint(), "float64")
     if catalogue.fails(*combined):

@@ -89,11 +89,17 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         progress_meter,
     ):
         del throw, passed_solver_state
-        y, carry, made_jump = private.start_of(init_state)
+        y, carry, made_jump, meter = private.start_of(init_state)
         system = bind(terms, args, y)
         unsupported = event, saveat.dense, passed_controller_state
         _check(solver, stepsize_controller, *unsupported)
         scheme = solver.scheme(system)
+        if scheme.has_history and isinstance(stepsize_controller, StepsBetween):
+            raise ValueError(
+                "Steps end at the times of `StepsBetween` because the motion is not "
+                f"smooth there, where the history of `{type(solver).__name__}` is of "
+                "no use. Use `TunedRKN6()` or `BlanesCasasRKN8()`."
+            )
         gradient = self.gradient
         if gradient is None:
             gradient = "reversal" if scheme.is_invertible else "checkpoints"
@@ -122,7 +128,7 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
             solver,
             max_steps,
             progress_meter,
-            private.meter_of(init_state),
+            meter,
         )
         adjoint = dataclasses.replace(self, gradient=gradient)
         final = _final_state(problem, adjoint, init_state, structure)
@@ -186,7 +192,7 @@ def _final_state(problem: Problem, adjoint: FixedStepAdjoint, init_state, struct
         out, eqxi.nondifferentiable_backward(counts)
     )
     return private.final_state(
-        private.without_start(init_state),
+        init_state,
         structure,
         y=end[0],
         solver_state=end[1],

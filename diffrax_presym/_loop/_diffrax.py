@@ -18,18 +18,15 @@ def flatten_subs(saveat: dfx.SaveAt) -> tuple[list[dfx.SubSaveAt], Any]:
     return jtu.tree_flatten(saveat.subs, is_leaf=is_sub)
 
 
-def start_of(state) -> tuple[PyTree, PyTree, Any]:
-    """The initial state and solver state, and whether that is stale."""
-    return state.y, state.solver_state, state.made_jump
+def start_of(state) -> tuple[PyTree, PyTree, Any, PyTree]:
+    """The initial state and solver state, whether that is stale, and the state of the
+    progress meter."""
+    return state.y, state.solver_state, state.made_jump, state.progress_meter_state
 
 
 def saved_buffers(state, structure) -> list[tuple[Array, PyTree]]:
     """The times and values to fill of each of `SaveAt(subs=...)`."""
     return [(save.ts, save.ys) for save in structure.flatten_up_to(state.save_state)]
-
-
-def meter_of(state) -> PyTree:
-    return state.progress_meter_state
 
 
 def final_state(
@@ -77,9 +74,3 @@ def final_state(
     }
     where = lambda x: [getattr(x, name) for name in new]
     return eqx.tree_at(where, state, list(new.values()), is_leaf=lambda x: x is None)
-
-
-def without_start(state):
-    """The initial state without what is part of the problem."""
-    where = lambda x: (x.y, x.solver_state, x.made_jump)
-    return eqx.tree_at(where, state, (None, None, False), is_leaf=lambda x: x is None)

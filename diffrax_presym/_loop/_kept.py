@@ -31,10 +31,10 @@ def kept_steps(adjoint: Any, problem: Problem) -> tuple[Array, Any]:
         most = problem.max_steps
         if most is None:
             raise ValueError(
-                'A gradient by `FixedStepAdjoint("checkpoints")` needs to know how '
-                "many steps to allocate memory for. Pass `diffeqsolve(..., "
-                'max_steps=...)`, or use `FixedStepAdjoint("reversal")` if the scheme '
-                "has an inverse."
+                "A gradient by checkpoints, the default of `FixedStepAdjoint` for a "
+                "scheme without an inverse, needs to know how many steps to allocate "
+                "memory for. Pass `diffeqsolve(..., max_steps=...)`, or use a scheme "
+                'with an inverse and `FixedStepAdjoint("reversal")`.'
             )
         number = adjoint.checkpoints
         parts = math.isqrt(most) if number is None else number + 1

@@ -75,8 +75,8 @@ class StepsBetween(dfx.AbstractStepSizeController):
         self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
     ):
         n, steps = controller_state
-        state = n + 1, steps
-        return True, t1, steps.time(n + 1), False, state, dfx.RESULTS.successful
+        kink, state = jnp.any(steps.first[1:] == n), (n + 1, steps)
+        return True, t1, steps.time(n + 1), kink, state, dfx.RESULTS.successful
 
 
 class Steps(eqx.Module):

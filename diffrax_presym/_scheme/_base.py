@@ -23,20 +23,18 @@ _ORDERS, _INNER_POINTS = (2, 4, 10, 14), (0, 1, 3, 5, 7)
 Point = tuple[State, PyTree]  # a state and the solver state
 
 
-def _nothing(system: System, t: Array, y: State) -> PyTree:
-    return None
-
-
 class Scheme(NamedTuple):
     """What a solver does with a system."""
 
     moves: Moves
     # The initial solver state, of the system, a time and a state.
-    start: Callable[[System, Array, State], PyTree] = _nothing
+    start: Callable[[System, Array, State], PyTree] = lambda system, t, y: None
     # From the solver state the force that ends a step, if it is known.
     end_force: Callable[[PyTree], PyTree | None] = lambda carry: None
     # Whether a step can be inverted from its end.
     is_invertible: bool = True
+    # Whether a step uses those before it, so that it must start again at a kink.
+    has_history: bool = False
     # Whether a step solves equations by iteration.
     is_implicit: bool = False
     # Why steps of unequal length must not be composed: these cancel errors only if the
@@ -45,7 +43,7 @@ class Scheme(NamedTuple):
 
 
 class AbstractPresymplecticSolver(dfx.AbstractSolver):
-    """A one-step scheme for a system such as [`diffrax_presym.MechanicalSystem`][].
+    """A scheme for a system such as [`diffrax_presym.MechanicalSystem`][].
 
     A scheme defines its moves; `diffrax.diffeqsolve` handles saving, events, adjoints
     and the direction of time. No scheme has an error estimate:

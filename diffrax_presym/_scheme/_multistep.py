@@ -72,7 +72,7 @@ class _Carry(NamedTuple):
     """The solver state: the history, in the frame of the end of the last step."""
 
     steps: Inexact[Array, ""]  # of one length so far; a float, as all leaves are
-    h: Inexact[Array, ""]  # that length, zero if there was no step
+    h: Inexact[Array, ""]  # that of the first of them, zero if there was no step
     momentum: PyTree  # the mean over the last step
     force: PyTree
     filter: PyTree[Inexact[Array, "lags ..."]]  # the state of the filter of forces
@@ -92,13 +92,13 @@ class Multistep(AbstractMove):
         (decay, data), split = data, system.split("shared")
         # From the frame of the start of the step to that of its end.
         move = lambda x: x if decay is None else tree.add(x, decay, x)
-        steps = _steps(span, old)
+        steps, length = _steps(span, old)
         is_short = steps < self.order - 1
 
         def one_step(y: State) -> tuple[PyTree, PyTree]:
             """The kick that takes the position where a step of the other scheme takes
             it, and the change of the momentum in that."""
-            moves = _ONE_STEP.scheme(system).moves
+            moves, y = _ONE_STEP.scheme(system).moves, tree.to_sums(y, tree.zeros(y))
             (end, _), _ = forward(moves, system, span, data, (y, None))
             free, _ = split.drift(system, t0, h, decay, (y[0], old.momentum))
             kick = system.term.kinetic.momentum(tree.sub(end[0], free))
@@ -124,7 +124,7 @@ class Multistep(AbstractMove):
         _, end = split.leave(system, t1, (tree.values(q), end))
         change = tree.where(is_short, gained, tree.sub(end, tree.values(y[1])))
         _, p = system.add(y, (None, change))
-        new = _Carry(steps + 1, cast_to(h, old.h), momentum, force, filter)
+        new = _Carry(steps + 1, length, momentum, force, filter)
         return ((q, p), new), None
 
     def undo(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
@@ -136,41 +136,45 @@ def _outer(column: tuple[float, ...], x: Array) -> Array:
     return cast_to(np.array(column[1:]), x).reshape(-1, *(1,) * x.ndim) * x[None]
 
 
-def _steps(span: Span, carry: _Carry) -> Array:
-    """How many steps had the length of this one, but for the rounding of times."""
+def _steps(span: Span, carry: _Carry) -> tuple[Array, Array]:
+    """How many steps had the length of this one, but for the rounding of times; and the
+    length of the first of them."""
     h = jnp.abs(span.h)
     largest = jnp.abs(span.t0) + h * carry.steps
     rounding = 8 * jnp.finfo(h.dtype).eps * largest
     same = jnp.abs(span.h - carry.h) <= jnp.minimum(rounding, 1e-3 * h)
-    return jnp.where(same, carry.steps, 0)
+    first = same & (carry.steps > 0)
+    return jnp.where(same, carry.steps, 0), jnp.where(first, carry.h, span.h)
 
 
 class SymmetricMultistep(AbstractPresymplecticSolver):
     r"""A symmetric multistep method: high order with one force evaluation per step.
 
-    8th or 10th order. One force evaluation per step. An output between two steps is a
-    step of [`diffrax_presym.BlanesCasasRKN8`][], of 19 evaluations, so that dense/ts
-    output in Diffrax's loop takes seven of these in each step. Save at ends of steps.
+    8th or 10th order. One force evaluation per step. The first `order - 1` steps, as
+    many after a jump or a change of the length of the steps, and outputs between steps
+    are steps of [`diffrax_presym.BlanesCasasRKN8`][], of 19 evaluations; their order is
+    8, and their error far below that of the method. Dense/ts output in Diffrax's loop
+    takes three of them in each step: save at the ends of steps.
 
     For a [`diffrax_presym.QuadraticKinetic`][], any potential and at most one constant
     rate of friction, with steps of one length, at errors of 1e-6 and less: where the
     force is most of the cost and no frequency is much higher than the others, as for
-    planets and molecules. Not for stiff springs next to soft ones, strong friction, or
-    few unknowns, for which [`diffrax_presym.TunedRKN6`][] is faster.
+    planets and molecules. Not for stiff springs next to soft ones, strong friction,
+    steps that vary, nor for few unknowns and cheap forces, for which
+    [`diffrax_presym.TunedRKN6`][] is faster.
 
     Symmetric, but not symplectic: the error in the energy stays small over long times
     if the motion is regular and the step is short enough (Hairer, Lubich and Wanner,
-    chapter XV). At some steps the method is unstable or resonates with the motion:
-    halve the step to see whether an error is that of the scheme.
+    chapter XV). At some steps the method is unstable or resonates with the motion: if
+    half the step does not reduce the error as the order says, change it by some per
+    cent. A step has no inverse: [`diffrax_presym.FixedStepAdjoint`][] takes the
+    gradient by checkpoints, for which it needs `max_steps`.
 
-    In the frame that positions and momenta share, $q = e^{-\gamma t / 2} x$, a step is
-    a kick by a filtered force and a drift. It is the method
-    $\sum_j \alpha_j x_{n+j} = h^2 \sum_j \beta_j x''_{n+j}$ written for increments. The
-    momentum at a step is computed from the same history, and is not fed back.
-
-    The first `order - 1` steps, and as many after a jump or a change of the length of
-    the steps, are steps of [`diffrax_presym.BlanesCasasRKN8`][]. A step has no inverse:
-    [`diffrax_presym.FixedStepAdjoint`][] takes the gradient by checkpoints.
+    With half of the friction taken out of positions and half out of momenta,
+    $q = e^{-\gamma t / 2} x$, friction is a force, and errors grow with the distance
+    from the origin. A step is a kick, by a weighted sum of the last forces and kicks,
+    and a drift: the method $\sum_j \alpha_j x_{n+j} = h^2 \sum_j \beta_j x''_{n+j}$
+    written for increments. The momentum at a step is computed from the same history.
 
     ??? cite "Reference"
 
@@ -192,7 +196,7 @@ class SymmetricMultistep(AbstractPresymplecticSolver):
     def __init__(self, order: int = 8):
         """**Arguments:**
 
-        - `order`: 8 or 10. Defaults to 8, which allows the longest steps; with 80 steps
+        - `order`: 8 or 10. Defaults to 8, which allows the longest steps; with 90 steps
             or more to the shortest period, 10 is more accurate. The coefficients are of
             this package, `benchmarks/multistep.py`.
 
@@ -229,6 +233,7 @@ class SymmetricMultistep(AbstractPresymplecticSolver):
             Multistep(self.multistep_order),
             start=start,
             is_invertible=False,
+            has_history=True,
             not_composable=(
                 "Compositions of unequal steps are not possible with "
                 "`SymmetricMultistep`, which needs steps of one length. Compose "

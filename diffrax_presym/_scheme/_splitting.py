@@ -160,6 +160,11 @@ class Splitting(AbstractSplitting):
                 "`SplittingTableau(order=...)` must be a positive integer, but got "
                 f"{tableau.order!r}."
             )
+        if tableau.kind not in ("separable", "any", "nystrom", "linear"):
+            raise ValueError(
+                '`SplittingTableau(kind=...)` must be "separable", "any", "nystrom" or '
+                f'"linear", but got {tableau.kind!r}.'
+            )
         fractions = tuple(float(x) for x in tableau.fractions)
         first, second = fractions[0::2], fractions[1::2]
         sums = math.fsum(first), math.fsum(second)

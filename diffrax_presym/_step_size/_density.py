@@ -25,11 +25,11 @@ class StepDensityController(dfx.AbstractStepSizeController):
     then takes the same steps, and energy errors stay bounded as with constant steps.
     Steps are never rejected and never negative.
 
-    For very uneven motion, such as close encounters; with every symmetric scheme of
-    this package and any solver of Diffrax. Not for smooth motion, where constant steps
-    are cheaper. For attraction that is unbounded as bodies approach each other take the
-    distance to the power 3/2, by Kepler's third law: a close encounter takes as many
-    steps as a distant one. Of several distances take
+    For very uneven motion, such as close encounters; with every symmetric one-step
+    scheme of this package and any solver of Diffrax. Not for smooth motion, where
+    constant steps are cheaper. For attraction that is unbounded as bodies approach each
+    other take the distance to the power 3/2, by Kepler's third law: a close encounter
+    takes as many steps as a distant one. Of several distances take
     $\big( \sum_k r_k^{-3} \big)^{-1/2}$. Steps of equal length in phase space have the
     density $|(\dot q, \dot p)|^{-1}$. Requires `dt0=None`; a solve fails with
     `RESULTS.dt_min_reached` if a step vanishes, as it does where the density is

@@ -10,7 +10,9 @@ from jaxtyping import Array, Inexact, PyTree
 
 from .._friction._fit import has_one_rate
 from .._numbers import as_time, State
+from .._scheme._base import AbstractPresymplecticSolver
 from .._system._base import AbstractSystem
+from .._system._bound import bind
 
 
 def structure_defect(
@@ -24,10 +26,10 @@ def structure_defect(
     r"""The error of conformal symplecticity of one step.
 
     The largest entry of $J^T \Omega J - e^{\eta(t_0) - \eta(t_1)} \Omega$, where $J$ is
-    the Jacobian of the step: zero to rounding for the schemes of this package. Those
-    with two copies of the system are conformally symplectic in the doubled phase space;
-    their defect in `y` alone is small but not zero. Only for systems whose friction is
-    one rate of damping.
+    the Jacobian of the step: zero to rounding for the one-step schemes of this package.
+    Those with two copies of the system are conformally symplectic in the doubled phase
+    space; their defect in `y` alone is small but not zero. Only for systems whose
+    friction is one rate of damping.
 
     **Arguments:**
 
@@ -38,7 +40,7 @@ def structure_defect(
 
     **Raises:**
 
-    `ValueError` if the system has other friction.
+    `ValueError` if the system has other friction, or for a multistep method.
     """
     force = getattr(system, "external", None)
     if not has_one_rate(system.parts) or force is not None:
@@ -46,6 +48,12 @@ def structure_defect(
             "`structure_defect` is the defect of conformal symplecticity, which only "
             "one rate of damping for all momenta preserves, but this "
             f"`{type(system).__name__}` has other friction or a `force`."
+        )
+    own = isinstance(solver, AbstractPresymplecticSolver)
+    if own and solver.scheme(bind(system, args, y)).has_history:
+        raise ValueError(
+            f"A step of `{type(solver).__name__}` depends on those before it, so that "
+            "one does not show what is preserved. It is symmetric, not symplectic."
         )
     return _structure_defect(system, solver, as_time(t0), as_time(t1), y, args)
 
