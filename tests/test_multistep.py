@@ -98,8 +98,8 @@ def test_rounding(wrap):
     times = map(dtype, (0.0, 20.0, 20 / 2000))
     args = *times, y0, ONE.astype(dtype)
     options: dict = dict(adjoint=FIXED, max_steps=2001)
-    exact = ends(system(None), EXACT, 0.0, 20.0, 0.05, Y0, ONE)
-    error = largest(ends(system(None), solver, *args, **options), exact)
+    exact = ends(system(0.1), EXACT, 0.0, 20.0, 0.05, Y0, ONE)
+    error = largest(ends(system(0.1), solver, *args, **options), exact)
     assert error < (2e-7 if isinstance(solver, dps.Compensated) else 1e-5)
 
 

@@ -102,7 +102,8 @@ class Multistep(AbstractMove):
             (end, _), _ = forward(moves, system, span, data, (y, None))
             free, _ = split.drift(system, t0, h, decay, (y[0], old.momentum))
             kick = system.term.kinetic.momentum(tree.sub(end[0], free))
-            return tree.scale(1 / (h * h * move(1.0)), kick), tree.sub(end[1], y[1])
+            kick = tree.scale(1 / (h * h * move(jnp.ones_like(h))), kick)
+            return kick, tree.sub(end[1], y[1])
 
         # A batch computes it if one of its members needs it.
         zeros = lambda y: (tree.zeros(y[1]), tree.zeros(y[1]))
