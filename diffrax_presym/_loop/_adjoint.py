@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._checks import as_positive
-from .._scheme._base import AbstractPresymplecticSolver
+from .._scheme._base import AbstractPresymplecticSolver, Scheme
 from .._system._bound import bind
 from . import _diffrax as private
 from ._backward import Backward
@@ -94,20 +94,6 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         unsupported = event, saveat.dense, passed_controller_state
         _check(solver, stepsize_controller, *unsupported)
         scheme = solver.scheme(system)
-        if scheme.has_history and isinstance(stepsize_controller, StepsBetween):
-            raise ValueError(
-                "Steps end at the times of `StepsBetween` because the motion is not "
-                f"smooth there, where the history of `{type(solver).__name__}` is of "
-                "no use. Use `TunedRKN6()` or `BlanesCasasRKN8()`."
-            )
-        gradient = self.gradient
-        if gradient is None:
-            gradient = "reversal" if scheme.is_invertible else "checkpoints"
-        elif gradient == "reversal" and not scheme.is_invertible:
-            raise ValueError(
-                f"A step of `{type(solver).__name__}` has no known inverse. Write "
-                "`FixedStepAdjoint()`, which takes its gradient by checkpoints."
-            )
         if made_jump is not False:
             # The solver state is stale, and is recomputed before the first step.
             restart = lambda: scheme.start(system, system.time(t0), y)
@@ -130,6 +116,7 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
             progress_meter,
             meter,
         )
+        gradient = _gradient(self.gradient, solver, scheme, stepsize_controller)
         adjoint = dataclasses.replace(self, gradient=gradient)
         final = _final_state(problem, adjoint, init_state, structure)
         return final, {"order": solver.order(terms)}
@@ -176,6 +163,25 @@ def _check(solver, controller, event, dense, passed_controller_state) -> None:
         raise ValueError(
             f"`FixedStepAdjoint` does not support {what}. Use {instead} instead."
         )
+
+
+def _gradient(wanted: str | None, solver, scheme: Scheme, controller) -> str:
+    """How the gradient is taken; an error if the scheme does not allow it."""
+    name = type(solver).__name__
+    if scheme.has_history and isinstance(controller, StepsBetween):
+        raise ValueError(
+            "Steps end at the times of `StepsBetween` because the motion is not smooth "
+            f"there, where the history of `{name}` is of no use. Use `TunedRKN6()` or "
+            "`BlanesCasasRKN8()`."
+        )
+    if wanted == "reversal" and not scheme.is_invertible:
+        raise ValueError(
+            f"A step of `{name}` has no known inverse. Write `FixedStepAdjoint()`, "
+            "which takes its gradient by checkpoints."
+        )
+    if wanted is None:
+        return "reversal" if scheme.is_invertible else "checkpoints"
+    return wanted
 
 
 _none = lambda x: x is None
