@@ -492,10 +492,8 @@ HAMILTONIANS = {
             Mistake("has other friction", ONE_RATE, RATE),
         )
         for name, law in {
-            "coefficients": dps.ViscousDamping(1.0),
             "numbers": dps.ConstantDamping(VECTOR),
             "a function of several numbers": lambda t: VECTOR * t,
-            "drag": dps.Drag(1.0),
         }.items()
     },
     "damping of the general family by a number": (
