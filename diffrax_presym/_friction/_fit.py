@@ -139,7 +139,8 @@ def _as_matrix(rate: Array, like: Array) -> Array:
     if is_matrix(rate, like):
         return rate
     entries = jnp.broadcast_to(rate, jnp.shape(like))
-    return entries[..., None] * jnp.eye(entries.shape[-1], dtype=entries.dtype)
+    one = jnp.eye(entries.shape[-1], dtype=entries.dtype)
+    return entries[..., None] * jnp.expand_dims(one, range(entries.ndim - 1))
 
 
 def one_rate(parts: Parts) -> Damping | None:
