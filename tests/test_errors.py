@@ -269,6 +269,10 @@ SOLVERS = {
         )
         for order in (0, 2.0)
     },
+    "tableau for an unknown kind of split": (
+        lambda: dps.Splitting(dps.SplittingTableau(2, True, "shared", (0.5, 1.0, 0.5))),
+        Mistake("got 'shared'", "`SplittingTableau(kind=...)` must be", '"nystrom"'),
+    ),
     "tableau of another kind": (
         lambda: dps.Splitting((0.5, 1.0, 0.5)),  # type: ignore
         Mistake(
@@ -495,6 +499,13 @@ HAMILTONIANS = {
             "numbers": dps.ConstantDamping(VECTOR),
             "a function of several numbers": lambda t: VECTOR * t,
         }.items()
+    },
+    **{
+        f"damping of the paper's family, {type(law).__name__}": (
+            lambda law=law: dps.DissipativeHamiltonian(KINETIC, harmonic, DAMPING, law),
+            Mistake("is friction per velocity", "needs to know the mass", "`force=f`"),
+        )
+        for law in (dps.ViscousDamping(1.0), dps.Drag(1.0))
     },
     "damping of the general family by a number": (
         lambda: dps.DissipativeHamiltonian(KINETIC, harmonic, DAMPING, 0.2),

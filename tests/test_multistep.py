@@ -144,6 +144,17 @@ def test_kinks_at_equal_distances(adjoint):
         assert_close(run(dps.SymmetricMultistep()).ys, run(EXACT).ys, 1e-8)
 
 
+def test_integer_times():
+    """In a step by hand."""
+    solver, term = dps.SymmetricMultistep(), system(0.1)
+
+    def step(t0, t1):
+        carry = solver.init(term, t0, t1, Y0, ONE)
+        return solver.step(term, t0, t1, Y0, ONE, carry, made_jump=False)[0]
+
+    assert_close(step(0, 1), step(0.0, 1.0), 1e-15)
+
+
 def test_what_one_step_does_not_show():
     args = 0.0, 0.1, Y0, ONE
     with pytest.raises(ValueError, match="not symplectic"):

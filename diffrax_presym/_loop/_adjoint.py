@@ -45,9 +45,9 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     the recomputed states is measured at each kept state, and one beyond `tol` raises an
     error. By `gradient="checkpoints"`, and for schemes without an inverse, the steps
     between kept states are computed again instead; the memory then grows with the
-    square root of the number of steps. For
-    second derivatives use forward mode over reverse mode, `jax.jvp` of `jax.grad`; for
-    forward mode alone `diffrax.ForwardMode()`.
+    square root of the number of steps. For second derivatives use forward mode over
+    reverse mode, `jax.jvp` of `jax.grad`; for forward mode alone
+    `diffrax.ForwardMode()`.
     """
 
     gradient: Literal["reversal", "checkpoints"] | None = None
@@ -94,6 +94,8 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         unsupported = event, saveat.dense, passed_controller_state
         _check(solver, stepsize_controller, *unsupported)
         scheme = solver.scheme(system)
+        _check_history(solver, scheme, stepsize_controller)
+        gradient = _gradient(self.gradient, solver, scheme)
         if made_jump is not False:
             # The solver state is stale, and is recomputed before the first step.
             restart = lambda: scheme.start(system, system.time(t0), y)
@@ -116,7 +118,6 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
             progress_meter,
             meter,
         )
-        gradient = _gradient(self.gradient, solver, scheme, stepsize_controller)
         adjoint = dataclasses.replace(self, gradient=gradient)
         final = _final_state(problem, adjoint, init_state, structure)
         return final, {"order": solver.order(terms)}
@@ -165,19 +166,21 @@ def _check(solver, controller, event, dense, passed_controller_state) -> None:
         )
 
 
-def _gradient(wanted: str | None, solver, scheme: Scheme, controller) -> str:
-    """How the gradient is taken; an error if the scheme does not allow it."""
-    name = type(solver).__name__
+def _check_history(solver, scheme: Scheme, controller) -> None:
     if scheme.has_history and isinstance(controller, StepsBetween):
         raise ValueError(
             "Steps end at the times of `StepsBetween` because the motion is not smooth "
-            f"there, where the history of `{name}` is of no use. Use `TunedRKN6()` or "
-            "`BlanesCasasRKN8()`."
+            f"there, where the history of `{type(solver).__name__}` is of no use. Use "
+            "`TunedRKN6()` or `BlanesCasasRKN8()`."
         )
+
+
+def _gradient(wanted: str | None, solver, scheme: Scheme) -> str:
+    """How the gradient is taken; an error if the scheme does not allow it."""
     if wanted == "reversal" and not scheme.is_invertible:
         raise ValueError(
-            f"A step of `{name}` has no known inverse. Write `FixedStepAdjoint()`, "
-            "which takes its gradient by checkpoints."
+            f"A step of `{type(solver).__name__}` has no known inverse. Write "
+            "`FixedStepAdjoint()`, which takes its gradient by checkpoints."
         )
     if wanted is None:
         return "reversal" if scheme.is_invertible else "checkpoints"
