@@ -162,8 +162,8 @@ def has_one_rate(parts: Parts) -> bool:
     def is_number(part: LinearPart) -> bool:
         if part.per_velocity or is_operator(part.form):
             return False
-        values = jax.eval_shape(part.log_scale.rate, jnp.zeros(()))
-        return jtu.tree_map(jnp.shape, part.form) == () and values.shape == ()
+        shape = jtu.tree_map(jnp.shape, part.form)
+        return shape == () and part.log_scale.shape == ()
 
     linear, *other = parts
     return not any(other) and all(map(is_number, linear))

@@ -57,6 +57,11 @@ class AbstractLogScale(eqx.Module):
     def rate(self, t: Time) -> Inexact[Array, "..."]:
         r"""The rate $\eta'(t)$."""
 
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape of the rate."""
+        return jax.eval_shape(self.rate, jnp.zeros(())).shape
+
     def effect(self, rate: Array, t: Time, h: Time, order: int) -> Effect:
         """What friction of this log scale times a rate does from `t` to `t + h`, by a
         quadrature of at least the given order in `h` where it is not known in closed
@@ -91,6 +96,7 @@ class Linear(AbstractLogScale):
     r"""$\eta(t) = t$."""
 
     is_autonomous: ClassVar[bool] = True
+    shape: ClassVar[tuple[int, ...]] = ()  # known without tracing
 
     def __call__(self, t: Time) -> Scalar:
         return as_time(t)
