@@ -319,6 +319,15 @@ def test_gradients_of_rows_that_are_not_reached():
     np.testing.assert_allclose(jax.grad(loss)(0.2), slope(loss, 0.2), 1e-7)
 
 
+def test_the_derivative_in_time_of_a_stage_in_the_middle_of_its_step():
+    def loss(h):
+        step = mechanical(dps.ViscousDamping(C)), dps.PresymplecticGauss(1), 0.0, h, h
+        return jnp.sum(last(solve(*step, Y0, adjoint=dfx.ForwardMode()))[0])
+
+    derivative = jax.jit(jax.jacfwd(loss))
+    np.testing.assert_allclose(derivative(0.3), slope(jax.jit(loss), 0.3), 1e-7)
+
+
 def test_a_scheme_is_compensated_once():
     with pytest.raises(ValueError, match="Remove one"):
         dps.Compensated(substeps(dps.Compensated(dps.TunedRKN6()), 2))
