@@ -71,8 +71,8 @@ def measure(problem, ts, table):
         start = time.perf_counter()
         try:
             step = dps.choose_step(run, 0.0, problem.t1, rtol=rtol, atol=rtol)
-        except RuntimeError as error:
-            table.row(problem.name, rtol, str(error)[:7], *[None] * 7)
+        except RuntimeError:
+            table.row(problem.name, rtol, *[None] * 7)
             continue
         seconds = time.perf_counter() - start
         got = scaled(run(step.dt0).ys, exact, rtol)
