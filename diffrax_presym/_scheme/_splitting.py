@@ -251,8 +251,8 @@ class BlanesMoanRKN4(AbstractSplitting):
     4th order and symmetric. Six force evaluations per step. Uses Hermite
     interpolation for dense/ts output, at the cost of another step.
 
-    For quadratic kinetic energies or quadratic potentials: the first choice at moderate
-    accuracy.
+    For quadratic kinetic energies or quadratic potentials, at low accuracy, where a step
+    of [`diffrax_presym.TunedRKN6`][] is longer than the accuracy needs.
 
     Source: Blanes and Moan (2002), see [`diffrax_presym.BlanesMoan4`][].
     """
@@ -281,8 +281,8 @@ class BlanesCasasRKN8(AbstractSplitting):
     8th order and symmetric. Nineteen force evaluations per step. Uses Hermite
     interpolation for dense/ts output, at the cost of three more steps.
 
-    For quadratic kinetic energies or quadratic potentials: the first choice for errors
-    close to rounding in `float64`.
+    For quadratic kinetic energies or quadratic potentials: for errors of 1e-9 or
+    smaller, of motions that are not oscillations about an equilibrium.
 
     ??? cite "Reference"
 
@@ -305,8 +305,8 @@ class TunedRKN6(AbstractSplitting):
     6th order and symmetric. Fourteen force evaluations per step. Uses Hermite
     interpolation for dense/ts output, at the cost of three more steps.
 
-    For quadratic kinetic energies or quadratic potentials: the first choice from six
-    digits on. For oscillations about equilibria its error is much smaller than that of
+    For quadratic kinetic energies or quadratic potentials: the first choice, with
+    [`diffrax_presym.choose_step`][]. For oscillations about equilibria its error is much smaller than that of
     [`diffrax_presym.BlanesMoanRKN6`][] at equal cost.
 
     Source: this package, `benchmarks/tuning.py`. The coefficients satisfy the
