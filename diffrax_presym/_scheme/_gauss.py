@@ -72,8 +72,7 @@ class Collocation(AbstractMove):
         values, lost = system.values(sums), tree.rounding_errors(sums)
         to_middle = None if data is None else data.to_middle
         move = lambda y: (y[0], system.move_frame(to_middle, y[1]))
-        frame = self.number, data, span.t0, span.h
-        step = GaussStep(system, *frame, move(values), move(lost))
+        step = GaussStep(system, self.number, data, span, move(values), move(lost))
         slopes, result = self._solve(step, self._guess(system, data, span, carry))
         sums = system.add(sums, _change(system, data, slopes, values[1]))
         # The solution depends on none of it, except by rounding.
@@ -111,11 +110,11 @@ class Collocation(AbstractMove):
     def _solve(self, step: GaussStep, guess: Slopes):
         if self.root_finder is None:
             limits = self.max_iterations, self.tolerance
-            find = lambda guess: fixed_point(step, guess, *limits)
-            return implicit(step, find, guess, contract)
-        how = self.root_finder, self.max_iterations
-        find = lambda guess: by_root_finder(step, guess, *how)
-        return implicit(step, find, guess, factorise)
+            find, tangent = eqx.Partial(fixed_point, *limits), contract
+        else:
+            how = self.root_finder, self.max_iterations
+            find, tangent = eqx.Partial(by_root_finder, *how), factorise
+        return implicit(step, guess, find=find, tangent=tangent)
 
 
 def _change(

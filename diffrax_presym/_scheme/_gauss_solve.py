@@ -1,5 +1,6 @@
 """The solution of the equations of the stages of Gauss collocation."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -17,7 +18,8 @@ from .. import _tree as tree
 from .._friction._linear import Effects
 from .._numbers import cast_to, State
 from .._system._bound import System
-from ._collocation import gauss_table, GaussTable
+from ._collocation import gauss_table
+from ._engine import Span
 
 
 # Velocities and forces of all stages, times weight and length of the step, the forces
@@ -40,31 +42,24 @@ class Frames(NamedTuple):
 class GaussStep(eqx.Module):
     """The equations of the stages of one step."""
 
-    system: System
-    stages_number: int = eqx.field(static=True)
-    frames: Frames | None
-    t0: Array
-    h: Array
+    number: int = eqx.field(static=True)
     base: State  # the state at the start, in the frame of the middle
     base_lost: State
+    h: Array
+    slopes: Callable[[Stages], Slopes]
 
-    @property
-    def table(self) -> GaussTable:
-        return gauss_table(self.stages_number)
-
-    @property
-    def times(self) -> Array:
-        return self.t0 + cast_to(self.table.nodes, self.h) * self.h
-
-    def stages(self, slopes: Slopes) -> Stages:
-        # Add the small terms first.
-        gained = jtu.tree_map(lambda x: matrix_product(self.table.mu, x), slopes)
-        add = lambda y, lost, x: y[None] + (lost[None] + x)
-        return jtu.tree_map(add, self.base, self.base_lost, gained)
-
-    def slopes(self, stages: Stages) -> Slopes:
-        system, frames = self.system, self.frames
+    def __init__(
+        self,
+        system: System,
+        number: int,
+        frames: Frames | None,
+        span: Span,
+        base: State,
+        base_lost: State,
+    ):
+        table, t0, h = gauss_table(number), span.t0, span.h
         both = (None, None) if frames is None else (frames.outwards, frames.inwards)
+        self.number, self.h, self.base, self.base_lost = number, h, base, base_lost
 
         def one(t, weight, both, q, p):
             outwards, inwards = both
@@ -72,8 +67,20 @@ class GaussStep(eqx.Module):
             velocity, force = system.velocity_and_force(t, (q, p))
             return tree.scale(weight, (velocity, system.move_frame(inwards, force)))
 
-        weights = cast_to(self.table.weights, self.h) * self.h
-        return jax.vmap(one)(self.times, weights, both, *stages)
+        def slopes(stages: Stages) -> Slopes:
+            times = t0 + cast_to(table.nodes, h) * h
+            return jax.vmap(one)(times, cast_to(table.weights, h) * h, both, *stages)
+
+        # Traced once, with all that it depends on, to be differentiated.
+        many = lambda x: jnp.broadcast_to(x, (number, *x.shape))
+        self.slopes = eqx.filter_closure_convert(slopes, jtu.tree_map(many, base))
+
+    def stages(self, slopes: Slopes) -> Stages:
+        # Add the small terms first.
+        mu = gauss_table(self.number).mu
+        gained = jtu.tree_map(lambda x: matrix_product(mu, x), slopes)
+        add = lambda y, lost, x: y[None] + (lost[None] + x)
+        return jtu.tree_map(add, self.base, self.base_lost, gained)
 
     def residual(self, slopes: Slopes) -> Slopes:
         return tree.sub(self.slopes(self.stages(slopes)), slopes)
@@ -87,25 +94,25 @@ def matrix_product(matrix, x):
     )
 
 
-def implicit(step: GaussStep, find, guess: Slopes, tangent):
-    """The slopes that are found, with the derivatives of the implicit function.
+@eqx.filter_custom_jvp
+def implicit(step: GaussStep, guess: Slopes, *, find, tangent):
+    """The slopes that `find(step, guess)` returns, and its result, with the derivatives
+    of the implicit function."""
+    return find(step, guess)
 
-    `find` returns them and a result.
-    """
 
-    def as_float(residual, guess):
-        slopes, result = find(guess)
-        # `custom_root` gives integers a derivative of the wrong type.
-        code, kind = jtu.tree_flatten(result)
-        kinds.append(kind)
-        return slopes, [jnp.asarray(x, jnp.float32) for x in code]
-
-    kinds = []
-    slopes, code = lax.custom_root(
-        lambda x: step.residual(x), guess, as_float, tangent, has_aux=True
-    )
-    code = [lax.stop_gradient(x).astype(jnp.int32) for x in code]
-    return slopes, jtu.tree_unflatten(kinds[-1], code)
+@implicit.def_jvp
+def _implicit_jvp(primals, tangents, *, find, tangent):
+    (step, _), (changes, _) = primals, tangents
+    slopes, result = implicit(*primals, find=find, tangent=tangent)
+    is_none = lambda x: x is None
+    moves = jtu.tree_map(lambda x: x is not None, changes, is_leaf=is_none)
+    moving, fixed = eqx.partition(step, moves)
+    residual = lambda moving: eqx.combine(moving, fixed).residual(slopes)
+    _, explicit = jax.jvp(residual, (moving,), (changes,))
+    _, linear = jax.linearize(step.residual, slopes)
+    change = tangent(linear, tree.scale(-1, explicit))
+    return (slopes, result), (change, jtu.tree_map(lambda _: None, result))
 
 
 class _Search(NamedTuple):
@@ -134,7 +141,7 @@ _NEGLIGIBLE = 1e-3
 _ROUNDING = 16.0
 
 
-def fixed_point(step: GaussStep, guess: Slopes, max_iterations: int, tolerance: float):
+def fixed_point(max_iterations: int, tolerance: float, step: GaussStep, guess: Slopes):
     """Fixed-point iteration, to rounding unless a tolerance is given.
 
     It stops when its changes no longer decrease. The remaining error is rounding, of
@@ -197,10 +204,10 @@ def fixed_point(step: GaussStep, guess: Slopes, max_iterations: int, tolerance: 
 
 
 def by_root_finder(
-    step: GaussStep,
-    guess: Slopes,
     root_finder: optx.AbstractRootFinder,
     max_steps: int,
+    step: GaussStep,
+    guess: Slopes,
 ):
     # Extrapolation of stiff components may be inaccurate.
     sizes = (tree.largest(step.residual(x)) for x in (guess, tree.zeros(guess)))
