@@ -16,7 +16,8 @@ from ._numbers import cast_to
 def as_parameter(x, name: str) -> Inexact[Array, "..."]:
     """A user's number as a leaf for `jax.grad` and `eqx.filter_grad`."""
     if not eqx.is_array_like(x):
-        raise ValueError(f"{name} must be a real number, but got {x!r}.")
+        array = " Write `jnp.array(...)`." if isinstance(x, list | tuple) else ""
+        raise ValueError(f"{name} must be a real number, but got {x!r}.{array}")
     if jnp.issubdtype(jnp.result_type(x), jnp.complexfloating):
         raise ValueError(f"{name} must be real, but got {x!r}.")
     if not jnp.issubdtype(jnp.result_type(x), jnp.floating):

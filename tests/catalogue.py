@@ -720,9 +720,7 @@ SCHEMES = [
     Scheme("Strang", dps.Strang, 2, "any"),
     Scheme("Blanes-Moan 4", dps.BlanesMoan4, 4, "any"),
     Scheme("Blanes-Moan 6", dps.BlanesMoan6, 6, "any"),
-    Scheme(
-        *("Suzuki4 of Strang", lambda: dps.Suzuki4(dps.Strang()), 4, "any"),
-    ),
+    Scheme(*("Suzuki4 of Strang", lambda: dps.Suzuki4(dps.Strang()), 4, "any")),
     Scheme("RKN4", dps.BlanesMoanRKN4, 4, "nystrom"),
     Scheme("RKN6", dps.BlanesMoanRKN6, 6, "nystrom"),
     Scheme("TunedRKN6", dps.TunedRKN6, 6, "nystrom"),
@@ -736,10 +734,7 @@ SCHEMES = [
         *("multistep 10", lambda: dps.SymmetricMultistep(10), 10, "shared"),
         composable=False,
     ),
-    Scheme(
-        *("Tao", dps.PresymplecticTao, 2, None),
-        composable=False,
-    ),
+    Scheme(*("Tao", dps.PresymplecticTao, 2, None), composable=False),
     Scheme("Tao 4", _tao4, 4, None, inside=False),
     Scheme(
         "midpoint", lambda find: dps.PresymplecticGauss(1, find), 2, None, implicit=True

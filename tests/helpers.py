@@ -67,11 +67,7 @@ SCHEMES = [
     Scheme("tao", dps.PresymplecticTao(), 2, 3, kind="augmented"),
     Scheme("tao_fixed", dps.PresymplecticTao(5.0), 2, 3, kind="augmented"),
     Scheme(
-        "tao_4",
-        dps.SuzukiYoshida(4, dps.PresymplecticTao(5.0)),
-        4,
-        9,
-        kind="augmented",
+        "tao_4", dps.SuzukiYoshida(4, dps.PresymplecticTao(5.0)), 4, 9, kind="augmented"
     ),
 ]
 # One scheme for each code path; the others differ only in their coefficients.

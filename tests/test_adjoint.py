@@ -163,8 +163,7 @@ def _saving_steps(t0, t1, dt0, y0):
 @pytest.mark.variants(1)
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64], ids=lambda x: x.__name__)
 @pytest.mark.parametrize(
-    "t0, t1, dt0",
-    [(0.0, 1.0, 0.1), (0.3, 7.8, 0.3), (-2.0, 5.0, 7.0)],
+    "t0, t1, dt0", [(0.0, 1.0, 0.1), (0.3, 7.8, 0.3), (-2.0, 5.0, 7.0)]
 )
 def test_steps_are_found_again_to_rounding(t0, t1, dt0, dtype):
     t0, t1, dt0 = (jnp.asarray(t, dtype) for t in (t0, t1, dt0))
@@ -422,14 +421,8 @@ def controlled(controller: Any, event: Any = None):
     "wrong, what",
     [
         (lambda: solve(INPUTS, REVERSIBLE, dfx.Tsit5()), "Tsit5"),
-        (
-            lambda: solve(INPUTS, FIXED_STEP, dfx.Tsit5()),
-            "FixedStepAdjoint.*Tsit5",
-        ),
-        (
-            lambda: solve(INPUTS, REVERSIBLE, dfx.HalfSolver(LEAPFROG)),
-            "HalfSolver",
-        ),
+        (lambda: solve(INPUTS, FIXED_STEP, dfx.Tsit5()), "FixedStepAdjoint.*Tsit5"),
+        (lambda: solve(INPUTS, REVERSIBLE, dfx.HalfSolver(LEAPFROG)), "HalfSolver"),
         (
             lambda: controlled(
                 dfx.ConstantStepSize(), dfx.Event(lambda t, y, args, **kwargs: t > 2)
@@ -493,10 +486,7 @@ def _held(k, holder, adjoint):
     )
     y0 = (jnp.array([1.0]), jnp.array([0.0]))
     sol = dfx.diffeqsolve(
-        hamiltonian,
-        dps.PresymplecticLeapfrog(),
-        *(0.0, 1.0, 0.1, y0),
-        adjoint=adjoint,
+        hamiltonian, dps.PresymplecticLeapfrog(), *(0.0, 1.0, 0.1, y0), adjoint=adjoint
     )
     assert sol.ys is not None
     return jnp.sum(sol.ys[0])

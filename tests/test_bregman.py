@@ -54,15 +54,9 @@ MIRRORS = [
     ),
     Mirror("entropy", dps.EntropyMirror(), lambda w: jnp.sum(jnp.exp(w))),
     Mirror("simplex", SIMPLEX, jsp.logsumexp),
+    Mirror("own", dps.MirrorMap(entropy, found), lambda w: jnp.sum(jnp.exp(w))),
     Mirror(
-        "own",
-        dps.MirrorMap(entropy, found),
-        lambda w: jnp.sum(jnp.exp(w)),
-    ),
-    Mirror(
-        "own inverse",
-        dps.MirrorMap(entropy, jnp.exp),
-        lambda w: jnp.sum(jnp.exp(w)),
+        "own inverse", dps.MirrorMap(entropy, jnp.exp), lambda w: jnp.sum(jnp.exp(w))
     ),
 ]
 NAMED = {mirror.name: mirror for mirror in MIRRORS}

@@ -156,12 +156,7 @@ RKN4, GAUSS = dps.BlanesMoanRKN4(), dps.PresymplecticGauss(2)
 
 
 @pytest.mark.parametrize(
-    "solver, options",
-    [
-        (RKN4, {}),
-        (RKN4, {"throw": True}),
-        (GAUSS, {}),
-    ],
+    "solver, options", [(RKN4, {}), (RKN4, {"throw": True}), (GAUSS, {})]
 )
 def test_a_step_that_is_too_large_is_no_error(solver, options, caplog):
     stiff = system_of(lambda t, q, args: 1e3 * jnp.sum(q**4), 0.0)
@@ -184,6 +179,14 @@ def test_a_failure_after_a_success_is_no_error():
         solve(0.001)
     step = dps.choose_step(solve, 0.0, 1.0, rtol=1e-4, atol=1e-4)
     assert any(np.isinf(trial.error) for trial in step.trials)
+
+
+def test_an_error_of_the_users_own_is_raised():
+    def solve(dt0):
+        raise RuntimeError("no table")
+
+    with pytest.raises(RuntimeError, match="no table"):
+        dps.choose_step(solve, 0.0, 1.0, rtol=1e-3, atol=1e-3)
 
 
 def test_single_precision():

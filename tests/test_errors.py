@@ -387,7 +387,7 @@ MASS = "`QuadraticKinetic(mass)`"
 LAW = "must be a law of friction, a function eta(t) or a list of these"
 RATE = "`ConstantDamping(rate)`"
 ONE_RATE = "Only one rate of damping for all momenta has a log scale"
-VECTOR = jnp.array([0.1, 0.2])
+VECTOR, PLACES = jnp.array([0.1, 0.2]), jnp.ones((3, 2))
 
 HAMILTONIANS = {
     **{
@@ -446,8 +446,7 @@ HAMILTONIANS = {
     ),
     "energy of many numbers": (
         lambda: trace(
-            dps.Hamiltonian(lambda t, q, p, args: q * p),
-            dps.PresymplecticTao(),
+            dps.Hamiltonian(lambda t, q, p, args: q * p), dps.PresymplecticTao()
         ),
         Mistake("The energy", f"{ONE_NUMBER}, but returned float64[2]", SUM_OVER),
     ),
@@ -458,6 +457,18 @@ HAMILTONIANS = {
     "kinetic energy is no function": (
         lambda: dps.MechanicalSystem(2.0, harmonic),
         Mistake("got 2.0", "a kinetic energy or a function `T(t, p, args)`", MASS),
+    ),
+    "kinetic energy of one argument": (
+        lambda: dps.MechanicalSystem(lambda p: p @ p, harmonic),
+        Mistake("the arguments (p)", "`kinetic` must be a function", "`T(t, p, args)`"),
+    ),
+    "split that is no split": (
+        lambda: dps.Hamiltonian(lambda t, q, p, args: p @ p, splits=(3,)),
+        Mistake("got (3,)", "must be a tuple of", "`extend.AbstractSplit`"),
+    ),
+    "sum over pairs": (
+        lambda: dps.pairwise_potential(lambda t, r, a: jnp.sum(r))(0.0, PLACES, None),
+        Mistake("got float64[]", "needs the energy of each pair", "Do not sum"),
     ),
     "energy is no function": (
         lambda: dps.Hamiltonian(3.0),

@@ -7,15 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from helpers import (
-    assert_close,
-    CARRIES,
-    each,
-    flat,
-    oscillator,
-    pendulum,
-    Scheme,
-)
+from helpers import assert_close, CARRIES, each, flat, oscillator, pendulum, Scheme
 
 import diffrax_presym as dps
 

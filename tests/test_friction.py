@@ -150,10 +150,7 @@ def test_a_power_alone_from_rest(solver):
     law = [dps.LogDamping(0.0), dps.PowerDamping(0.5, 0.5)]
     rhs = lambda t, y: [y[1], -y[0] - 0.25 * t**-0.5 * y[1]]
     exact = scipy.integrate.solve_ivp(
-        *(rhs, (1e-10, 2), [1, -1e-10], "Radau"),
-        t_eval=TIMES,
-        rtol=1e-10,
-        atol=1e-12,
+        *(rhs, (1e-10, 2), [1, -1e-10], "Radau"), t_eval=TIMES, rtol=1e-10, atol=1e-12
     ).y[0]
     found = positions(law, 0.01, solver)
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-4)

@@ -95,10 +95,7 @@ HAMILTONIANS = {
         dps.MechanicalSystem(kinetic, potential),
         lambda t, q, P: kinetic(t, P, ARGS) + potential(t, q, ARGS),
     ),
-    "nonseparable": (
-        dps.Hamiltonian(energy),
-        lambda t, q, P: energy(t, q, P, ARGS),
-    ),
+    "nonseparable": (dps.Hamiltonian(energy), lambda t, q, P: energy(t, q, P, ARGS)),
     "conformal, undamped": (
         dps.MechanicalSystem(QUADRATIC, potential),
         lambda t, q, P: quadratic(P) + potential(t, q, ARGS),

@@ -4,14 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.integrate
 import scipy.special
-from helpers import (
-    few,
-    harmonic,
-    reference,
-    Scheme,
-    SCHEMES,
-    trajectory,
-)
+from helpers import few, harmonic, reference, Scheme, SCHEMES, trajectory
 
 import diffrax_presym as dps
 

@@ -215,11 +215,44 @@ def test_equal_laws_of_both_energies_from_a_singularity():
     assert distance(end(general), end(mechanical(law))) < 1e-12
 
 
+@pytest.mark.parametrize("shift", [0.0, 1.0])
+def test_two_laws_of_a_relativistic_energy_from_a_singularity(shift):
+    law, t0 = dps.LogDamping(3.0, shift), -shift
+    two = dps.RelativisticKinetic(), harmonic, law, law
+    system, y0 = dps.DissipativeHamiltonian(*two), (jnp.ones(2), jnp.zeros(2))
+    end = last(solve(system, dps.BlanesMoan4(), t0, t0 + 1, 1e-2, y0))
+    assert distance(end, last(exact(system, t0, t0 + 1, y0))) < 1e-4
+
+
 def test_powers_without_a_singularity():
-    for delta in (1.0, 2.0):
+    for delta in (0.0, 1.0, 2.0):
         system = mechanical(dps.PowerDamping(0.3, delta))
         end = last(solve(system, dps.TunedRKN6(), 0.0, 2.0, 0.1, Y0))
         assert distance(end, last(exact(system, 0.0, 2.0, Y0))) < 1e-9
+
+
+def test_the_derivative_in_time_of_a_power_that_starts_at_zero():
+    def end(law, t0):
+        times = t0, t0 + 1, 0.1
+        forward = dict(max_steps=20, adjoint=dfx.ForwardMode())
+        return last(solve(mechanical(law), dps.Strang(), *times, Y0, **forward))[0]
+
+    laws = dps.PowerDamping(0.5, 2.0), lambda t: 0.5 * t * t
+    slopes = [jax.jacfwd(lambda t0, law=law: end(law, t0))(0.0) for law in laws]
+    assert distance(*slopes) < 1e-12
+
+
+def test_a_law_that_joins_linear_and_other_friction():
+    class Joined(dps.extend.AbstractFriction):
+        def parts(self, mechanics):
+            drag = dps.Drag(0.5).parts(mechanics)
+            return dps.ConstantDamping(0.1).parts(mechanics) + drag
+
+        def force(self, t, q, p, v, args):
+            return -0.1 * p - 0.5 * jnp.linalg.norm(v) * v
+
+    with pytest.raises(ValueError, match="Write two laws"):
+        mechanical(Joined())
 
 
 def test_friction_by_place_as_a_matrix_and_as_a_number():
@@ -272,6 +305,12 @@ def test_momenta_of_velocities():
             v = size * np.random.default_rng(seed).standard_normal(3) / 2
             y = system.from_velocity(0.0, (jnp.zeros(3), jnp.asarray(v)))
             np.testing.assert_allclose(system.to_velocity(0.0, y)[1], v, 1e-10)
+    fast, v = (
+        dps.Hamiltonian(lambda t, q, p, a: jnp.sqrt(1 + p @ p)),
+        jnp.array([0.999]),
+    )
+    wanted = 0.999 / np.sqrt(1 - 0.999**2)
+    np.testing.assert_allclose(fast.from_velocity(0.0, (v, v))[1], wanted, 1e-10)
 
 
 def test_steps_for_a_fast_force_and_for_times_in_single_precision():

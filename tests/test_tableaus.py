@@ -140,8 +140,7 @@ def test_one_evaluation_of_the_force_for_each_kick(name):
 
     force.defjvp(lambda q, dq: (force(*q), -dq[0]))
     system = dps.MechanicalSystem(
-        dps.QuadraticKinetic(),
-        dps.ForceField(lambda t, q, args: force(q)),
+        dps.QuadraticKinetic(), dps.ForceField(lambda t, q, args: force(q))
     )
     steps = 8
     sol = solve(system, SPLITTINGS[name], 0.0, 1.0, 1 / steps, Y0)

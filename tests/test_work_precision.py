@@ -69,11 +69,7 @@ def wrong(dt0):
 
 @pytest.fixture(scope="module")
 def result():
-    solves = {
-        "tuned": TUNED,
-        "Tsit5": solve_by(dfx.Tsit5()),
-        "wrong": wrong,
-    }
+    solves = {"tuned": TUNED, "Tsit5": solve_by(dfx.Tsit5()), "wrong": wrong}
     return work_precision(
         *(solves, 0.0, 10.0),
         rtol=1e-6,

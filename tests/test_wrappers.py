@@ -123,11 +123,7 @@ def test_compensation_saves_digits(solver):
 
 @pytest.mark.parametrize(
     "wrap",
-    [
-        dps.Suzuki4,
-        lambda base: substeps(base, 2),
-        dfx.HalfSolver,
-    ],
+    [dps.Suzuki4, lambda base: substeps(base, 2), dfx.HalfSolver],
     ids=["composition", "substeps", "half steps"],
 )
 def test_steps_of_nominal_length_inside_others(wrap):

@@ -126,7 +126,7 @@ def exponentials(
 
 
 def _norm(matrix: Array) -> Array:
-    return lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(matrix), axis=-2)))
+    return lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(matrix), axis=-2), initial=0))
 
 
 def _product(x: Array, y: Array) -> Array:

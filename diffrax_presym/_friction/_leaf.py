@@ -58,7 +58,7 @@ class EntryFriction(eqx.Module):
         return jnp.where(functools.reduce(jnp.logical_or, singular), limit, net)
 
     def amplification(self, t: Time, h: Time) -> Scalar:
-        return jnp.exp(jnp.max(increment(self.terms, t, h)))
+        return jnp.exp(jnp.max(increment(self.terms, t, h), initial=-jnp.inf))
 
     def is_singular(self, t: Time) -> Bool[Array, ""] | None:
         return reduce_any([law.is_singular(t) for law, _ in self.terms])

@@ -168,28 +168,33 @@ class Power(AbstractLogScale):
     is_autonomous: ClassVar[bool] = False
 
     def _parameters(self, t: Time):
-        """Whether time is zero, the time, or 1 there, and the exponent."""
-        t = as_time(t)
-        return t == 0, jnp.where(t == 0, 1, t), cast_to(self.delta, t)
+        """Whether time is zero, the time where it is, which is zero with its
+        derivative, the time elsewhere, or 1, and the exponent."""
+        zero, t = as_time(t) == 0, as_time(t)
+        here, since = jnp.where(zero, t, 0), jnp.where(zero, 1, t)
+        return zero, here, since, cast_to(self.delta, t)
 
     def __call__(self, t: Time) -> Scalar:
         t = as_time(t)
         return t ** cast_to(self.delta, t)
 
     def increment(self, t: Time, h: Time) -> Scalar:
-        zero, since, delta = self._parameters(t)
+        zero, here, since, delta = self._parameters(t)
         h = as_time(h)
         grown = since**delta * expm1(delta * jnp.log1p(h / since))
-        return jnp.where(zero, jnp.where(zero, h, 1) ** delta, grown)
+        first = jnp.where(zero, here + h, 1) ** delta - here ** jnp.maximum(delta, 1)
+        return jnp.where(delta == 0, 0, jnp.where(zero, first, grown))
 
     def rate(self, t: Time) -> Scalar:
-        zero, since, delta = self._parameters(t)
-        first = jnp.where(delta == 1, 1, jnp.where(delta < 1, jnp.inf, 0))
-        return jnp.where(zero, first, delta * since ** (delta - 1))
+        zero, here, since, delta = self._parameters(t)
+        smooth = delta * here ** jnp.maximum(delta - 1, 1)
+        first = jnp.where(delta == 1, 1, jnp.where(delta < 1, jnp.inf, smooth))
+        rate = jnp.where(zero, first, delta * since ** (delta - 1))
+        return jnp.where(delta == 0, 0, rate)
 
     def is_singular(self, t: Time) -> Bool[Array, ""]:
-        zero, _, delta = self._parameters(t)
-        return zero & jnp.any(delta < 1)
+        zero, *_, delta = self._parameters(t)
+        return zero & jnp.any((delta < 1) & (delta != 0))
 
 
 class FunctionOfTime(AbstractLogScale):

@@ -17,8 +17,8 @@ class Composition(AbstractPresymplecticSolver):
     """Several steps of a scheme as one, given by weights.
 
     Order as given. The cost per step is that of the base times the number of weights.
-    Uses Hermite interpolation for dense/ts output, at the cost of up to three more
-    steps.
+    Uses Hermite interpolation for dense/ts output, at the cost of up to seven
+    more steps.
 
     With equal weights, `Composition(base, (1 / n,) * n)`, it is `n` steps of the base,
     and what Diffrax's loop does once per step is done `n` times less often.
@@ -88,8 +88,8 @@ def SuzukiYoshida(
     r"""The triple jump of Suzuki and Yoshida, to any even order.
 
     Order as given; $3^{r/2 - 1}$ force evaluations per step at order $r$. Symmetric.
-    Uses Hermite interpolation for dense/ts output, at the cost of up to three more
-    steps.
+    Uses Hermite interpolation for dense/ts output, at the cost of up to seven
+    more steps.
 
     The scheme of the paper. Its error constants are large, and its stages extend beyond
     both ends of the step, by up to 0.35, 0.65 and 0.92 of its length at orders 4, 6 and

@@ -132,7 +132,7 @@ class Splitting(AbstractSplitting):
 
     Order as stated by the tableau; one force evaluation per kick, and one less if the
     step starts with a kick. Uses Hermite interpolation for dense/ts output, at the
-    cost of up to three more steps.
+    cost of up to seven more steps.
 
     For systems whose kinetic part has a known flow, where it is far more accurate
     than a composition at equal cost.
@@ -251,8 +251,8 @@ class BlanesMoanRKN4(AbstractSplitting):
     4th order and symmetric. Six force evaluations per step. Uses Hermite
     interpolation for dense/ts output, at the cost of another step.
 
-    For quadratic kinetic energies or quadratic potentials, at low accuracy, where a step
-    of [`diffrax_presym.TunedRKN6`][] is longer than the accuracy needs.
+    For quadratic kinetic energies or quadratic potentials, at low accuracy, where steps
+    of [`diffrax_presym.TunedRKN6`][] are too long.
 
     Source: Blanes and Moan (2002), see [`diffrax_presym.BlanesMoan4`][].
     """
@@ -306,8 +306,8 @@ class TunedRKN6(AbstractSplitting):
     interpolation for dense/ts output, at the cost of three more steps.
 
     For quadratic kinetic energies or quadratic potentials: the first choice, with
-    [`diffrax_presym.choose_step`][]. For oscillations about equilibria its error is much smaller than that of
-    [`diffrax_presym.BlanesMoanRKN6`][] at equal cost.
+    [`diffrax_presym.choose_step`][]. For oscillations about equilibria its error is
+    much smaller than that of [`diffrax_presym.BlanesMoanRKN6`][] at equal cost.
 
     Source: this package, `benchmarks/tuning.py`. The coefficients satisfy the
     conditions of order 6, and reduce the remaining error for oscillators over a range

@@ -52,11 +52,9 @@ class Solution(NamedTuple):
             with _quiet():
                 sol = jax.device_get(solve(step))
         except (RuntimeError, ValueError) as error:
-            # As `diffeqsolve` raises if a solve fails. From the second call of a
-            # function on, `jax.jit` raises the same error as a `ValueError`.
-            if isinstance(error, ValueError) and "EquinoxRuntimeError" not in str(
-                error
-            ):
+            # As `diffeqsolve` raises if a solve fails, by the name of its type or, from
+            # inside of `jax.jit`, in the text of another.
+            if "EquinoxRuntimeError" not in f"{type(error).__name__} {error}":
                 raise
             return cls(number, number, np.zeros(0), [], False, None)
         if not isinstance(sol, dfx.Solution):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
 from .._checks import as_positive, describe
-from .._numbers import cast_to, Scalar
+from .._numbers import as_time, cast_to, Scalar
 from .._system._base import AbstractSystem
 
 
@@ -124,6 +124,9 @@ class StepDensityController(dfx.AbstractStepSizeController):
     def reverse(self, t, y, args, controller_state):
         """The `controller_state` for a solve back along the same steps.
 
+        For a solve forwards in time. Of one backwards in time the state is that of
+        `controller.wrap(-1).reverse(-t, y, args, controller_state)`.
+
         **Arguments:**
 
         - `t`, `y`: the time and state at the end of the solve.
@@ -135,7 +138,7 @@ class StepDensityController(dfx.AbstractStepSizeController):
 
     def _density(self, t, y, args):
         r"""$\log \sigma$, and the change of $z$ per step."""
-        t = jnp.asarray(t)
+        t = as_time(t)
 
         def log_density(t, y):
             sigma = self.density(self.direction * t, y, args)

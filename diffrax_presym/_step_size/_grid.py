@@ -14,6 +14,8 @@ def intervals(ts: np.ndarray, t0: float, t1: float) -> int | None:
     rounding = 4 * np.finfo(ts.dtype).eps * max(size, 1)
     gaps = np.diff(np.concatenate([[0.0], where, [1.0]]))
     gaps = gaps[gaps > rounding]
+    if not gaps.size:
+        return None
     # The mean of all that are equal, to average out the rounding.
     shortest = np.mean(gaps[gaps < 1.1 * np.min(gaps)])
     # The spacing may be a multiple of that of the grid, as for times half-way between

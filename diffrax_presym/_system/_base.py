@@ -2,6 +2,7 @@ import abc
 from collections.abc import Callable
 
 import diffrax as dfx
+import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -119,6 +120,12 @@ class AbstractSystem(dfx.AbstractTerm):
     def parts(self) -> Parts:
         """The friction, by where it acts; `ValueError` if a law does not fit."""
         each = [law.parts(self.mechanics) for law in self.laws]
+        for law, parts in zip(self.laws, each, strict=True):
+            if parts.linear and any(parts[1:]):
+                raise ValueError(
+                    f"`{type(law).__name__}.parts` must not join linear friction with "
+                    "other friction. Write two laws: `friction=[first, second]`."
+                )
         return sum(each, Parts())  # pyright: ignore
 
     def add_forces(
@@ -184,7 +191,11 @@ class AbstractSystem(dfx.AbstractTerm):
         miss = lambda p: tree.sub(self.velocity(t, q, p, args), v)
         residual = lambda p, _: tree.scale(unit, miss(p))
         finder = optx.Newton(rtol=10 * eps, atol=10 * eps)
-        return q, optx.root_find(residual, finder, v).value
+        p = optx.root_find(residual, finder, v, max_steps=64, throw=False).value
+        # Rounding of the energy may be larger than that of the velocity.
+        missed = ~(tree.largest(residual(p, None)) <= eps**0.5)
+        message = "`from_velocity` found no momentum of this velocity."
+        return q, eqx.error_if(p, missed, message)
 
     def to_velocity(self, t: Time, y: State, args: PyTree = None) -> tuple[Q, Q]:
         """Positions and velocities `(q, v)` of a state `(q, p)`: save them by

@@ -60,6 +60,12 @@ class Hamiltonian(AbstractSystem):
         self.fn = energy
         self.friction = as_laws(friction)
         self.external = force
+        sequence = isinstance(splits, tuple | list)
+        if not sequence or not all(isinstance(x, AbstractSplit) for x in splits):
+            raise ValueError(
+                "`Hamiltonian(splits=...)` must be a tuple of `extend.AbstractSplit`, "
+                f"but got {splits!r}."
+            )
         self.known = tuple(splits)
         _ = self.parts  # An error if a law does not fit the system.
 

@@ -10,7 +10,7 @@ import lineax as lx
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
 from .. import _tree as tree
-from .._checks import as_positive, scalar_fn
+from .._checks import as_positive, check_callable, scalar_fn
 from .._forms import as_form, divide, multiply
 from .._friction._base import MASS
 from .._friction._exponential import gauss_legendre
@@ -201,6 +201,8 @@ class RelativisticKinetic(AbstractKinetic):
 
     def rescale(self, s: Scalar) -> "RelativisticKinetic":
         speed = self.speed * cast_to(jnp.exp(-s), self.speed)
+        # Where it is infinite the velocity is that of the quadratic energy.
+        speed = jnp.minimum(speed, float(jnp.finfo(speed.dtype).max) ** 0.5)
         return eqx.tree_at(lambda k: k.speed, self, speed)
 
 
@@ -229,6 +231,7 @@ def as_kinetic(kinetic) -> AbstractKinetic:
     if isinstance(kinetic, AbstractKinetic):
         return kinetic
     if callable(kinetic):
+        check_callable(kinetic, "kinetic", "T(t, p, args)")
         return CallableKinetic(kinetic)
     raise ValueError(
         "`kinetic` must be a kinetic energy or a function `T(t, p, args)`, but got "

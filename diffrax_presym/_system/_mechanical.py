@@ -93,8 +93,8 @@ class MechanicalSystem(AbstractSystem):
         stiffness that is not known; and when the solve is traced, if a function has the
         wrong arguments or returns values of the wrong shape.
         """
-        self.kinetic = as_kinetic(kinetic)
         self.potential = as_potential(potential)
+        self.kinetic = as_kinetic(kinetic)
         check_callable(force, "force", "f(t, q, v, args)", optional=True)
         self.friction = as_laws(friction)
         self.external = force
@@ -144,7 +144,7 @@ class MechanicalSystem(AbstractSystem):
     @property
     def splits(self) -> tuple[AbstractSplit, ...]:
         parts = self.parts
-        if self.external is not None:
+        if self.external is not None or parts.forces:
             return ()
         if parts.local or parts.drags:
             return (KineticSplit(frozenset({"any"})),)

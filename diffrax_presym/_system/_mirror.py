@@ -63,7 +63,7 @@ class EuclideanMirror(AbstractMirrorMap):
     r"""The mirror map $h(q) = \tfrac12 \, q \cdot M q$, with a linear $\nabla h$.
 
     Bregman dynamics is then separable, the quadratic case of the paper, and every
-    scheme applies.
+    one-step scheme for separable energies applies.
     """
 
     kinetic: QuadraticKinetic

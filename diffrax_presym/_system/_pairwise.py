@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from .._checks import as_parameter, as_positive, check_callable
+from .._checks import as_parameter, as_positive, check_callable, describe
 from .._numbers import cast_to, Scalar, Time
 
 
@@ -46,7 +46,14 @@ class _PairwisePotential(eqx.Module):
         # The root of zero has no derivative.
         apart = square > 0
         distance = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)
-        energies = jnp.where(same, 0, self.fn(t, distance, args))
+        energies = self.fn(t, distance, args)
+        if jnp.shape(energies) != distance.shape:
+            raise ValueError(
+                "`pairwise_potential(fn, ...)` needs the energy of each pair, an "
+                f"elementwise function of distances of shape {distance.shape}, but got "
+                f"{describe(energies)}. Do not sum over them."
+            )
+        energies = jnp.where(same, 0, energies)
         if self.masses is not None:
             masses = cast_to(self.masses, q)
             energies = masses[:, None] * masses[None, :] * energies

@@ -78,7 +78,8 @@ class _ScaledKinetic(AbstractKinetic):
         # Where it is minus infinity, as of 3 / t at zero, it has no derivatives, and
         # what is just after it is the limit of the difference.
         infinite, t = jnp.isneginf(self.eta2(t)), as_time(t)
-        just = math.sqrt(float(jnp.finfo(t.dtype).tiny))
+        info = jnp.finfo(t.dtype)
+        just = jnp.maximum(math.sqrt(float(info.tiny)), float(info.eps) * jnp.abs(t))
         near = jnp.where(infinite, t + just, t)
         eta1, eta2 = self.eta1(near), self.eta2(near)
         rescaled = self.kinetic.rescale(jnp.where(infinite, -jnp.inf, eta2))
