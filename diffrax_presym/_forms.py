@@ -25,11 +25,10 @@ def as_form(form, name: str, positive: bool):
         shape = jnp.shape(x)
         if not positive:
             return as_finite(x, name)
-        if len(shape) < 2 or shape[-1] != shape[-2]:
+        if len(shape) != 2 or shape[0] != shape[1]:
             return as_positive(x, name, _MASSLESS)
-        # They may be matrices, whose other entries may have any sign.
-        diagonal = jnp.diagonal(x, axis1=-2, axis2=-1)
-        as_positive(diagonal, f"The diagonal of {name}", _MASSLESS)
+        # It may be a matrix, whose other entries may have any sign.
+        as_positive(jnp.diagonal(x), f"The diagonal of {name}", _MASSLESS)
         return as_finite(x, name)
 
     return jtu.tree_map(leaf, form)

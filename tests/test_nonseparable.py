@@ -106,6 +106,7 @@ def test_outside_of_the_domain_is_a_result(name):
 MASSES = {
     "indefinite": lambda t, q, args: jnp.array([[1.0, 2.0], [2.0, 1.0]]),
     "positive at first": lambda t, q, args: jnp.eye(2) * (0.5 - t),
+    "positive at the stages": lambda t, q, args: jnp.eye(2) * jnp.sign(0.99 - t),
     "not symmetric": lambda t, q, args: jnp.array([[2.0, 0.1], [0.3, 1.0]]),
 }
 

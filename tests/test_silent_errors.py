@@ -305,10 +305,8 @@ def test_momenta_of_velocities():
             v = size * np.random.default_rng(seed).standard_normal(3) / 2
             y = system.from_velocity(0.0, (jnp.zeros(3), jnp.asarray(v)))
             np.testing.assert_allclose(system.to_velocity(0.0, y)[1], v, 1e-10)
-    fast, v = (
-        dps.Hamiltonian(lambda t, q, p, a: jnp.sqrt(1 + p @ p)),
-        jnp.array([0.999]),
-    )
+    fast = dps.Hamiltonian(lambda t, q, p, args: jnp.sqrt(1 + p @ p))
+    v = jnp.array([0.999])
     wanted = 0.999 / np.sqrt(1 - 0.999**2)
     np.testing.assert_allclose(fast.from_velocity(0.0, (v, v))[1], wanted, 1e-10)
 

@@ -41,9 +41,9 @@ class LagrangianSystem(AbstractSystem):
     solvers keep their order and symmetry.
 
     A mass matrix that is not positive definite gives a velocity of NaN. Solvers of this
-    package fail, with a `RESULTS` that is not successful, where it is not positive
-    definite at a stage, or not symmetric to rounding at the end of a step. Other
-    Diffrax solvers do not check the symmetry.
+    package check the mass matrix at the end of every step: a solve fails, with a
+    `RESULTS` that is not successful, where it is not positive definite or not symmetric
+    to rounding. Other Diffrax solvers do not check the symmetry.
 
     !!! example
 
@@ -177,8 +177,10 @@ class LagrangianSystem(AbstractSystem):
     ) -> Bool[Array, ""]:
         M = self.mass_matrix(t, q, args)
         rounding = 1e3 * float(jnp.finfo(M.dtype).eps) * jnp.max(jnp.abs(M), initial=0)
-        # That it is positive definite is seen where a velocity is needed.
-        return jnp.all(jnp.abs(M - M.T) <= rounding)
+        symmetric = jnp.all(jnp.abs(M - M.T) <= rounding)
+        # NaN if it is not positive definite; compiles faster than a velocity.
+        factor = jnp.linalg.cholesky(M, symmetrize_input=False)
+        return symmetric & jnp.all(jnp.isfinite(factor))
 
 
 @jax.jit
