@@ -102,8 +102,8 @@ def main():
         got, predicted = map(np.array, zip(*ratios, strict=True))
         print(
             f"\n{label}, error got over tolerance: mean "
-            f"{np.exp(np.mean(np.log(got))):.2f}, largest {np.max(got):.2f}, at most "
-            f"one {np.mean(got <= 1):.0%}\nerror got over predicted: "
+            f"{np.exp(np.mean(np.log(got))):.2f}, largest {np.max(got):.2f}, at least "
+            f"a third in {np.sum(got >= 1 / 3)} of {len(got)}\nerror got over predicted: "
             f"{np.min(predicted):.2f} to {np.max(predicted):.2f}"
         )
 

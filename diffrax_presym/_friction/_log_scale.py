@@ -168,8 +168,8 @@ class Power(AbstractLogScale):
     is_autonomous: ClassVar[bool] = False
 
     def _parameters(self, t: Time):
-        """Whether time is zero, the time where it is, which is zero with its
-        derivative, the time elsewhere, or 1, and the exponent."""
+        """Whether time is zero; the time there, or 0, which keeps its derivative; the
+        time elsewhere, or 1; and the exponent."""
         zero, t = as_time(t) == 0, as_time(t)
         here, since = jnp.where(zero, t, 0), jnp.where(zero, 1, t)
         return zero, here, since, cast_to(self.delta, t)
@@ -182,15 +182,15 @@ class Power(AbstractLogScale):
         zero, here, since, delta = self._parameters(t)
         h = as_time(h)
         grown = since**delta * expm1(delta * jnp.log1p(h / since))
-        first = jnp.where(zero, here + h, 1) ** delta - here ** jnp.maximum(delta, 1)
-        return jnp.where(delta == 0, 0, jnp.where(zero, first, grown))
+        before = jnp.where(delta == 0, 1, here ** jnp.maximum(delta, 1))
+        first = jnp.where(zero, here + h, 1) ** delta - before
+        return jnp.where(zero, first, grown)
 
     def rate(self, t: Time) -> Scalar:
         zero, here, since, delta = self._parameters(t)
-        smooth = delta * here ** jnp.maximum(delta - 1, 1)
-        first = jnp.where(delta == 1, 1, jnp.where(delta < 1, jnp.inf, smooth))
-        rate = jnp.where(zero, first, delta * since ** (delta - 1))
-        return jnp.where(delta == 0, 0, rate)
+        smooth = jnp.where(delta == 1, 1, delta * here ** jnp.maximum(delta - 1, 1))
+        first = jnp.where((delta < 1) & (delta != 0), jnp.inf, smooth)
+        return jnp.where(zero, first, delta * since ** (delta - 1))
 
     def is_singular(self, t: Time) -> Bool[Array, ""]:
         zero, *_, delta = self._parameters(t)
