@@ -103,7 +103,7 @@ def main():
         print(
             f"\n{label}, error got over tolerance: mean "
             f"{np.exp(np.mean(np.log(got))):.2f}, largest {np.max(got):.2f}, at least "
-            f"a third in {np.sum(got >= 1 / 3)} of {len(got)}\nerror got over predicted: "
+            f"a third in {np.sum(got >= 1 / 3)} of {len(got)}\nerror over predicted: "
             f"{np.min(predicted):.2f} to {np.max(predicted):.2f}"
         )
 
