@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 from jaxtyping import Array, Bool, Inexact, PyTree
 
+from .. import _tree as tree
 from .._checks import check_callable, describe, scalar_fn
 from .._friction._base import AbstractFriction, Mechanics
 from .._friction._damping import as_laws
@@ -178,9 +179,7 @@ class LagrangianSystem(AbstractSystem):
         M = self.mass_matrix(t, q, args)
         rounding = 1e3 * float(jnp.finfo(M.dtype).eps) * jnp.max(jnp.abs(M), initial=0)
         symmetric = jnp.all(jnp.abs(M - M.T) <= rounding)
-        # NaN if it is not positive definite; compiles faster than a velocity.
-        factor = jnp.linalg.cholesky(M, symmetrize_input=False)
-        return symmetric & jnp.all(jnp.isfinite(factor))
+        return symmetric & tree.all_finite((q, _solve_positive(M, p)))
 
 
 @jax.jit
