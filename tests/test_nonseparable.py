@@ -1,5 +1,7 @@
 """Energies that are neither separable nor split: two copies, or implicit steps."""
 
+from functools import partial
+
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
@@ -8,6 +10,7 @@ import optimistix as optx
 import pytest
 from helpers import flat, mixed_energy, solve, trajectory
 from jax.flatten_util import ravel_pytree
+from jax.test_util import check_grads
 
 import diffrax_presym as dps
 
@@ -111,9 +114,27 @@ MASSES = {
 }
 
 
+# One for each way of factorisation.
+SIZES = 2, 6, 20
+
+
+@pytest.mark.parametrize("n", SIZES)
 @pytest.mark.parametrize("mass", MASSES.values(), ids=MASSES)
-def test_a_mass_matrix_that_is_not_positive_and_symmetric_is_a_result(mass):
-    system = dps.LagrangianSystem(mass, lambda t, q, args: jnp.sum(q**2) / 2)
-    y0 = jnp.ones(2), jnp.ones(2)
+def test_a_mass_matrix_that_is_not_positive_and_symmetric_is_a_result(mass, n):
+    larger = lambda *at: jax.scipy.linalg.block_diag(mass(*at), jnp.eye(n - 2))
+    system = dps.LagrangianSystem(larger, lambda t, q, args: jnp.sum(q**2) / 2)
+    y0 = jnp.ones(n), jnp.ones(n)
     sol = solve(system, dps.PresymplecticGauss(2), 0.0, 1.0, 0.1, y0, throw=False)
     assert sol.result != dfx.RESULTS.successful
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_velocities_and_their_derivatives(n):
+    x = np.random.default_rng(n).standard_normal((n + 3, n))
+    mass = lambda t, q, args: x.T @ (jnp.cos(q[0]) * x) + jnp.diag(3 + jnp.sin(q))
+    system = dps.LagrangianSystem(mass, lambda t, q, args: jnp.zeros(()))
+    y = jnp.linspace(0.1, 0.5, n), jnp.linspace(0.2, 1.0, n)
+    velocity = partial(system.velocity, 0.0)
+    expected = np.linalg.solve(mass(0.0, *y), y[1])
+    assert velocity(*y) == pytest.approx(expected, rel=1e-12)
+    check_grads(velocity, y, order=2, rtol=1e-6, atol=1e-6)

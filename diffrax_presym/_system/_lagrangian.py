@@ -3,12 +3,14 @@
 from collections.abc import Callable
 
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 from jaxtyping import Array, Bool, Inexact, PyTree
 
 from .. import _tree as tree
 from .._checks import check_callable, describe, scalar_fn
+from .._forms import matvec
 from .._friction._base import AbstractFriction, Mechanics
 from .._friction._damping import as_laws
 from .._numbers import cast_to, Scalar, Time
@@ -19,8 +21,9 @@ from ._split import AbstractSplit
 _Vector = Inexact[Array, " n"]
 _Matrix = Inexact[Array, "n n"]
 
-# Up to this size a factorisation written out in full was measured faster than LAPACK.
-_SMALL = 6
+# The fastest factorisation depends on the size: written out in full, which for more
+# entries takes long to compile; a loop; and LAPACK, which takes long to call.
+_SMALL, _LARGE = 4, 16
 
 
 class LagrangianSystem(AbstractSystem):
@@ -32,8 +35,8 @@ class LagrangianSystem(AbstractSystem):
 
     $$q' = v = M^{-1} p, \qquad p' = \partial L / \partial q - C v + f(t, q, v).$$
 
-    $\partial L / \partial q$ is taken at constant $v$, so that one Cholesky
-    factorisation gives both velocity and force, and no derivative is taken through it.
+    $\partial L / \partial q$ is taken at constant $v$, so that one factorisation of
+    $M$ gives both velocity and force, and no derivative is taken through it.
     The energy is $E = p \cdot M^{-1} p / 2 + V$.
 
     Not separable: use [`diffrax_presym.PresymplecticGauss`][]. With friction at one
@@ -117,7 +120,7 @@ class LagrangianSystem(AbstractSystem):
 
     def mass_matrix(self, t: Time, q: _Vector, args: PyTree = None) -> _Matrix:
         """The mass matrix, in the precision of `q`."""
-        if not isinstance(q, jax.Array) or q.ndim != 1:
+        if not hasattr(q, "shape") or jnp.ndim(q) != 1:
             raise ValueError(
                 "`LagrangianSystem` needs positions `q` and momenta `p` that are "
                 f"vectors, arrays of shape (n,), but got {describe(q)}. Join them by "
@@ -182,16 +185,21 @@ class LagrangianSystem(AbstractSystem):
         return symmetric & tree.all_finite((q, _solve_positive(M, p)))
 
 
-@jax.jit
 def _solve_positive(M: _Matrix, p: _Vector) -> _Vector:
-    """The solution of `M v = p`, NaN if `M` is not positive definite.
+    """The solution of `M v = p`, NaN if `M` is not positive definite."""
+    # The derivative is that of the solution, not of the steps to it.
+    return lax.custom_linear_solve(
+        lambda v: matvec(M, v), p, lambda _, p: _factorise(M, p), symmetric=True
+    )
 
-    From the lower triangle of `M`, like LAPACK.
-    """
+
+def _factorise(M: _Matrix, p: _Vector) -> _Vector:
     n = len(p)
-    if n > _SMALL:
+    if n > _LARGE:
         L = jnp.linalg.cholesky(M, symmetrize_input=False)
         return jsl.cho_solve((L, True), p)
+    if n > _SMALL:
+        return _eliminate(M, p)
     # Cholesky's factorisation, scalar by scalar.
     L = [[M[i, j] for j in range(i + 1)] for i in range(n)]
     v = [p[i] for i in range(n)]
@@ -212,3 +220,15 @@ def _solve_positive(M: _Matrix, p: _Vector) -> _Vector:
             v[i] = v[i] - L[k][i] * v[k]
         v[i] = v[i] * inverse[i]
     return jnp.stack(v)
+
+
+def _eliminate(M: _Matrix, p: _Vector) -> _Vector:
+    """By Gauss--Jordan elimination, which needs no pivots if `M` is definite."""
+    rows = jnp.arange(len(p))[:, None]
+
+    def eliminate(k, A):
+        row = A[k] / jnp.where(A[k, k] > 0, A[k, k], jnp.nan)
+        return jnp.where(rows == k, row[None], A - jnp.outer(A[:, k], row))
+
+    A = jnp.concatenate([M, p[:, None]], axis=1)
+    return lax.fori_loop(0, len(p), eliminate, A)[:, -1]
