@@ -153,7 +153,7 @@ class Problem(eqx.Module):
             within = lambda: each(stop, starts, time, inside)
             ys = lax.cond(jnp.any(inside), within, lambda: ys)
         values = jax.vmap(lambda t, y: fns[i](t, y, system.args))(time, ys)
-        return values, jax.vmap(tree.all_finite)(ys)
+        return values, tree.all_finite(ys)
 
 
 class Progress(eqx.Module):
@@ -216,7 +216,9 @@ def run(problem: Problem, keep: Array | None = None):
             values, good = stacked[i]
             if problem.at_once:
                 values, good = problem.outputs(i, parameters, stacked[i], progress.n)
-            finite &= jnp.all(good | ~rows.reached(progress.n))
+            else:
+                good = jnp.all(good | ~rows.reached(progress.n))
+            finite &= good
         saved.append(values)
     success: Any = dfx.RESULTS.successful
     result = success if progress.result is None else progress.result
