@@ -987,10 +987,6 @@ def _saved(saveat):
     return run
 
 
-def _identity(t, y, args):
-    return y
-
-
 def _everything(problem, n, y0):
     ts = problem.times(IRREGULAR)
     subs = [

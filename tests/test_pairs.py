@@ -109,7 +109,6 @@ def covering() -> list[dict]:
 # One row.
 
 NUMBERS = [4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256]
-STRICT = jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise")
 
 
 def flat(y) -> np.ndarray:

@@ -4,7 +4,6 @@ import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 import pytest
 from helpers import (
     ANY,
@@ -36,7 +35,6 @@ WRAPPERS = {
     "substeps": lambda solver: substeps(solver, 2),
 }
 wrappers = pytest.mark.parametrize("wrap", WRAPPERS.values(), ids=WRAPPERS)
-_finder = optx.Newton(rtol=1e-12, atol=1e-12)
 
 
 def one_step(solver, hamiltonian: dps.extend.AbstractSystem = DAMPED):
