@@ -57,8 +57,8 @@ class EntryFriction(eqx.Module):
         limit = jnp.where(p == 0, force / (1 + strength), jnp.nan)
         return jnp.where(functools.reduce(jnp.logical_or, singular), limit, net)
 
-    def amplification(self, t: Time, h: Time) -> Scalar:
-        return jnp.exp(jnp.max(increment(self.terms, t, h), initial=-jnp.inf))
+    def growth(self, t: Time, h: Time) -> Scalar:
+        return jnp.max(increment(self.terms, t, h), initial=-jnp.inf)
 
     def is_singular(self, t: Time) -> Bool[Array, ""] | None:
         return reduce_any([law.is_singular(t) for law, _ in self.terms])
@@ -99,7 +99,7 @@ class MatrixFriction(eqx.Module):
     def net_force(self, t: Time, force: Array, p: Array) -> Array:
         return force - matvec(cast_to(self.matrix, p), p)
 
-    def amplification(self, t: Time, h: Time) -> Scalar:
+    def growth(self, t: Time, h: Time) -> Scalar:
         matrix = cast_to(self.matrix, h := as_time(h))
         symmetric = (matrix + jnp.swapaxes(matrix, -1, -2)) / 2
         # No more than this, by Gershgorin's circles, which compile in no time. Nothing
@@ -107,7 +107,7 @@ class MatrixFriction(eqx.Module):
         diagonal = jnp.diagonal(symmetric, axis1=-2, axis2=-1)
         radius = jnp.sum(jnp.abs(symmetric), axis=-1) - jnp.abs(diagonal)
         forwards, backwards = jnp.max(radius + diagonal), jnp.max(radius - diagonal)
-        return jnp.exp(jnp.where(h > 0, forwards, backwards) * jnp.abs(h))
+        return jnp.where(h > 0, forwards, backwards) * jnp.abs(h)
 
     def is_singular(self, t: Time) -> None:
         return None

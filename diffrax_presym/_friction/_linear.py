@@ -84,9 +84,10 @@ class LinearFriction(eqx.Module):
         net = lambda leaf, force, p: leaf.net_force(t, force, p)
         return jtu.tree_map(net, self.leaves, force, p, is_leaf=_is_leaf)
 
-    def amplification(self, t: Time, h: Time) -> Scalar:
-        """The factor by which errors of `p` grow from `t + h` back to `t`."""
-        return functools.reduce(jnp.maximum, self._each("amplification", t, h))
+    def growth(self, t: Time, h: Time) -> Scalar:
+        """The logarithm of the factor by which errors of `p` grow from `t + h` back to
+        `t`."""
+        return functools.reduce(jnp.maximum, self._each("growth", t, h))
 
     def is_singular(self, t: Time) -> Bool[Array, ""] | None:
         """Whether it is infinite at `t`; `None` if it never is."""

@@ -49,9 +49,9 @@ def kept_steps(adjoint: Any, problem: Problem) -> tuple[Array, Any]:
         # Each part may amplify rounding up to the limit.
         t0, t1 = (system.time(problem.steps.time(n)) for n in (first, problem.last))
         allowed, eps = limit(adjoint, problem.start[0])
-        amplified = jnp.log(system.friction.amplification(t0, t1 - t0))
-        needed = 2 * amplified / max(math.log(allowed / eps), 1)
-        # Infinite or undefined amplification needs as many as there are.
+        growth = system.friction.growth(t0, t1 - t0)
+        needed = 2 * growth / max(math.log(allowed / eps), 1)
+        # Infinite or undefined growth needs as many as there are.
         needed = jnp.where(needed < most, needed, most)
         parts = jnp.maximum(parts, jnp.ceil(needed).astype(parts.dtype))
     parts = jnp.clip(parts, 1, most)

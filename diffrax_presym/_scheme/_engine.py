@@ -175,8 +175,7 @@ def _unless_amplified(system: System, span: Span, data: PyTree) -> PyTree:
         return data
     arrays, other = eqx.partition(system.friction, eqx.is_array)
     friction = eqx.combine(lax.stop_gradient(arrays), other)
-    grown = friction.amplification(span.t1, -span.h)
-    bad = grown > 1 / math.sqrt(friction.precision)
+    bad = friction.growth(span.t1, -span.h) > -math.log(friction.precision) / 2
     return jtu.tree_map(lambda x: jnp.where(bad, jnp.nan, x), data)
 
 
