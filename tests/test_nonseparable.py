@@ -138,3 +138,17 @@ def test_velocities_and_their_derivatives(n):
     expected = np.linalg.solve(mass(0.0, *y), y[1])
     assert velocity(*y) == pytest.approx(expected, rel=1e-12)
     check_grads(velocity, y, order=2, rtol=1e-6, atol=1e-6)
+
+
+def test_gradient_of_a_chain_of_six_links():
+    below = 6.0 - np.maximum(*np.indices((6, 6)))
+    mass = lambda t, q, args: below * jnp.cos(q[:, None] - q[None])
+    height = lambda t, q, args: -9.81 * jnp.dot(below[0], jnp.cos(q))
+    arm = dps.LagrangianSystem(mass, height, dps.ViscousDamping(0.1))
+
+    def end(q):
+        options = {"adjoint": dps.FixedStepAdjoint(), "max_steps": None}
+        gauss = dps.PresymplecticGauss(3)
+        return solve(arm, gauss, 0.0, 0.5, 0.05, (q, jnp.zeros(6)), **options).ys
+
+    check_grads(end, (jnp.linspace(0.1, 1.0, 6),), 1, ["rev"], atol=1e-6, rtol=1e-6)
