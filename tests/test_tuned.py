@@ -178,6 +178,8 @@ def linear(damping):
     )
 
 
-@pytest.mark.parametrize("damping", [None, dps.ConstantDamping(0.3)], ids=bool)
+@pytest.mark.parametrize(
+    "damping", [None, dps.ConstantDamping(0.3)], ids=["none", "constant"]
+)
 def test_linear_steps_keep_structure_and_symmetry(damping):
     check_structure_and_symmetry(linear(damping), LINEAR, 1.0, 1.6)

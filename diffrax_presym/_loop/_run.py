@@ -136,7 +136,7 @@ class Problem(eqx.Module):
         self, i: int, parameters: Parameters, starts: PyTree, n: Array
     ) -> PyTree:
         """What output `i` saves in all rows, from the states at the starts of their
-        steps; of `n` steps."""
+        steps, of `n` steps; and whether all states are finite."""
         (system, fns), rows = parameters, self.rows[i]
         # Rows that are not reached repeat the first, or what is saved at the start, so
         # that nothing fails of which a gradient takes zero times.
@@ -213,11 +213,11 @@ def run(problem: Problem, keep: Array | None = None):
         values = None
         starts.append(stacked[i] if problem.at_once else None)
         if stacked[i] is not None:
-            values, good = stacked[i]
             if problem.at_once:
                 values, good = problem.outputs(i, parameters, stacked[i], progress.n)
             else:
-                good = jnp.all(good | ~rows.reached(progress.n))
+                values, each = stacked[i]
+                good = jnp.all(each | ~rows.reached(progress.n))
             finite &= good
         saved.append(values)
     success: Any = dfx.RESULTS.successful

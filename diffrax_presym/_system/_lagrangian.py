@@ -185,15 +185,17 @@ class LagrangianSystem(AbstractSystem):
         return symmetric & tree.all_finite((q, _solve_positive(M, p)))
 
 
+@jax.jit  # Outside of a solve, a loop would be compiled again by each call.
 def _solve_positive(M: _Matrix, p: _Vector) -> _Vector:
     """The solution of `M v = p`, NaN if `M` is not positive definite."""
     # The derivative is that of the solution, not of the steps to it.
     return lax.custom_linear_solve(
-        lambda v: matvec(M, v), p, lambda _, p: _factorise(M, p), symmetric=True
+        lambda v: matvec(M, v), p, lambda _, p: _by_size(M, p), symmetric=True
     )
 
 
-def _factorise(M: _Matrix, p: _Vector) -> _Vector:
+def _by_size(M: _Matrix, p: _Vector) -> _Vector:
+    """The same without derivatives, by the fastest factorisation of this size."""
     n = len(p)
     if n > _LARGE:
         L = jnp.linalg.cholesky(M, symmetrize_input=False)
