@@ -16,6 +16,7 @@ from helpers import oscillator
 from jax.core import Tracer
 
 import diffrax_presym as dps
+from diffrax_presym import _results
 from diffrax_presym._loop import _diffrax as private
 
 
@@ -258,3 +259,12 @@ def test_the_state_at_the_end_of_a_loop():
     assert eqx.tree_equal(ours.controller_state, theirs.controller_state, rtol=1e-12)
     assert set(theirs.stats) <= set(ours.stats)
     assert all(ours.stats[k] == theirs.stats[k] for k in theirs.stats)
+
+
+def test_further_results_are_entries_of_the_enumeration_of_diffrax():
+    result = _results.FRICTION_TOO_STRONG
+    assert isinstance(result, dfx.RESULTS)
+    assert result is dfx.RESULTS.friction_too_strong  # pyright: ignore
+    assert dfx.RESULTS[result].startswith("The friction over one step")
+    assert "friction_too_strong" in dfx.RESULTS._name_to_item
+    assert len(dfx.RESULTS._index_to_message) == len(dfx.RESULTS)

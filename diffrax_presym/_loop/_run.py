@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Int, PyTree
 
 from .. import _tree as tree
 from .._numbers import cast_to
+from .._results import NONFINITE
 from .._scheme._base import (
     AbstractPresymplecticSolver,
     advance,
@@ -28,7 +29,7 @@ from .._scheme._base import (
     Scheme,
 )
 from .._scheme._engine import cheap_iterations, prepare_once
-from .._system._bound import NONFINITE, System
+from .._system._bound import System
 from ._steps import Rows, Steps
 
 

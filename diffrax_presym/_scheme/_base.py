@@ -12,8 +12,9 @@ from jaxtyping import Array, PyTree
 from .. import _tree as tree
 from .._interpolation import HermiteInterpolation, inner_points
 from .._numbers import cast_to, State
+from .._results import NONFINITE
 from .._system._base import check_state
-from .._system._bound import bind, NONFINITE, System, unwrap
+from .._system._bound import bind, System, unwrap
 from ._engine import first_failure, forward, Moves, prepare, Result, Span
 
 

@@ -11,11 +11,11 @@ from jaxtyping import Array, ArrayLike, PyTree
 from .. import _tree as tree
 from .._friction._linear import LinearFriction
 from .._numbers import as_time, cast_to, State, Time
+from .._results import NONFINITE
 from ._base import AbstractSystem
 
 
 _T = TypeVar("_T")
-NONFINITE: Any = dfx.RESULTS.nonfinite  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class System(eqx.Module):

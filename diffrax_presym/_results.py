@@ -1,0 +1,46 @@
+"""Why a solve failed, where `diffrax.RESULTS` has no entry for it.
+
+Diffrax's loop takes entries of its own enumeration only, so these are added to it. The
+two private fields that this uses are tested in `tests/test_diffrax_contract.py`.
+"""
+
+from typing import Any
+
+import diffrax as dfx
+import numpy as np
+
+
+def _entry(name: str, message: str) -> Any:
+    """A further entry of `diffrax.RESULTS`."""
+    results: Any = dfx.RESULTS
+    if name not in results._name_to_item:
+        item = type(results.successful)
+        index = np.array(len(results._index_to_message), np.int32)
+        results._name_to_item[name] = item(index, results)
+        results._index_to_message.append(message)
+    return results._name_to_item[name]
+
+
+_SUCCESSFUL: Any = dfx.RESULTS.successful
+NONFINITE: Any = dfx.RESULTS.nonfinite  # pyright: ignore[reportAttributeAccessIssue]
+
+FRICTION_TOO_STRONG = _entry(
+    "friction_too_strong",
+    "The friction over one step, the rate times the length of the step, is more than "
+    "this scheme can resolve. Take shorter steps (`choose_step` finds them), or use "
+    "`Strang()`, which is stable, or `PresymplecticGauss(stages, root_finder)`.",
+)
+NOT_CONVERGED = _entry(
+    "fixed_point_not_converged",
+    "The fixed-point iteration of `PresymplecticGauss` did not converge in a step: the "
+    "step times the largest frequency of the system is too large. Take shorter steps, "
+    "or pass a root finder: `PresymplecticGauss(stages, optimistix.Newton(rtol, "
+    "atol))`. With `throw=False` the last time saved by `SaveAt(t1=True)` is that at "
+    "which the step started.",
+)
+STEP_DENSITY_MISSED = _entry(
+    "step_density_missed",
+    "A step differs from `epsilon` times the step density at one of its ends by more "
+    "than a factor of four: the density changes too much over a step. Reduce `epsilon` "
+    "of `StepDensityController`.",
+)
