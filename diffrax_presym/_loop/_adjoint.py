@@ -1,6 +1,5 @@
 """The loop for steps that are known beforehand, as an adjoint of Diffrax."""
 
-import dataclasses
 from typing import Literal
 
 import diffrax as dfx
@@ -15,10 +14,10 @@ from .._scheme._base import AbstractPresymplecticSolver, Scheme
 from .._system._bound import bind
 from . import _diffrax as private
 from ._backward import Backward
-from ._closures import closure_to_pytree
-from ._kept import kept_steps, pull_back
-from ._run import Problem, run, saved_rows
-from ._steps import Rows, Steps, StepsBetween
+from ._kept import Checkpoints, Reversal
+from ._problem import Problem
+from ._run import run, saved_rows
+from ._steps import Steps, StepsBetween
 
 
 class FixedStepAdjoint(dfx.AbstractAdjoint):
@@ -53,6 +52,7 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     gradient: Literal["reversal", "checkpoints"] | None = None
     checkpoints: int | None = None
     tol: float | None = None
+    throw: bool | None = None
 
     def __check_init__(self):
         if self.gradient not in (None, "reversal", "checkpoints"):
@@ -88,39 +88,46 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         passed_controller_state,
         progress_meter,
     ):
-        del throw, passed_solver_state
+        del passed_solver_state
         y, carry, made_jump, meter = private.start_of(init_state)
         system = bind(terms, args, y)
         unsupported = event, saveat.dense, passed_controller_state
         _check(solver, stepsize_controller, *unsupported)
         scheme = solver.scheme(system)
         _check_history(solver, scheme, stepsize_controller)
-        gradient = _gradient(self.gradient, solver, scheme)
+        way = self._way(solver, scheme, max_steps, throw)
         if made_jump is not False:
             # The solver state is stale, and is recomputed before the first step.
             restart = lambda: scheme.start(system, system.time(t0), y)
             carry = lax.cond(made_jump, restart, lambda: carry)
         subs, structure = private.flatten_subs(saveat)
-        fns = [sub.fn for sub in subs]
-        # Closures of functions are differentiated too.
-        system, fns = closure_to_pytree((system, fns))
-        steps = Steps(stepsize_controller, t0, t1, dt0)
-        without_fn = lambda sub: eqx.tree_at(lambda x: x.fn, sub, None, is_leaf=_none)
         problem = Problem(
-            system,
-            fns,
-            (y, carry),
-            steps,
-            [Rows(sub, steps, max_steps) for sub in subs],
-            list(map(without_fn, subs)),
             solver,
+            system,
+            subs,
+            (y, carry),
+            Steps(stepsize_controller, t0, t1, dt0),
             max_steps,
-            progress_meter,
-            meter,
+            (progress_meter, meter),
+            reversal=isinstance(way, Reversal),
         )
-        adjoint = dataclasses.replace(self, gradient=gradient)
-        final = _final_state(problem, adjoint, init_state, structure)
+        final = _final_state(problem, way, init_state, structure)
         return final, {"order": solver.order(terms)}
+
+    def _way(
+        self, solver, scheme: Scheme, max_steps: int | None, throw: bool
+    ) -> "Reversal | Checkpoints":
+        """How the gradient is taken; an error if the scheme does not allow it."""
+        if self.gradient == "reversal" and not scheme.is_invertible:
+            raise ValueError(
+                f"A step of `{type(solver).__name__}` has no known inverse. Write "
+                "`FixedStepAdjoint()`, which takes its gradient by checkpoints."
+            )
+        number = self.checkpoints
+        if scheme.is_invertible and self.gradient != "checkpoints":
+            raises = self.throw if self.throw is not None or throw else False
+            return Reversal(128 if number is None else number, self.tol, raises)
+        return Checkpoints(max_steps, number)
 
 
 FixedStepAdjoint.__init__.__doc__ = r"""**Arguments:**
@@ -175,27 +182,20 @@ def _check_history(solver, scheme: Scheme, controller) -> None:
         )
 
 
-def _gradient(wanted: str | None, solver, scheme: Scheme) -> str:
-    """How the gradient is taken; an error if the scheme does not allow it."""
-    if wanted == "reversal" and not scheme.is_invertible:
-        raise ValueError(
-            f"A step of `{type(solver).__name__}` has no known inverse. Write "
-            "`FixedStepAdjoint()`, which takes its gradient by checkpoints."
-        )
-    if wanted is None:
-        return "reversal" if scheme.is_invertible else "checkpoints"
-    return wanted
-
-
-_none = lambda x: x is None
-
-
-def _final_state(problem: Problem, adjoint: FixedStepAdjoint, init_state, structure):
+def _final_state(problem: Problem, way: Reversal | Checkpoints, init_state, structure):
     """Diffrax's state at the end of the solve."""
     buffers = private.saved_buffers(init_state, structure)
-    out, counts = eqx.partition(
-        _solve((problem, buffers), adjoint), eqx.is_inexact_array
-    )
+    try:
+        out = _solve((problem, buffers), way)
+    except TypeError as error:
+        if "forward-mode" not in str(error):
+            raise
+        raise ValueError(
+            "`FixedStepAdjoint` has no forward mode (`jax.jvp`, `jax.jacfwd`). Write "
+            "`adjoint=diffrax.ForwardMode()` for that; or for second derivatives "
+            "`jax.jvp` of `jax.grad`."
+        ) from error
+    out, counts = eqx.partition(out, eqx.is_inexact_array)
     # To JAX all outputs of a custom rule have derivatives, even integers.
     end, saved, n, result, meter = eqx.combine(
         out, eqxi.nondifferentiable_backward(counts)
@@ -214,7 +214,7 @@ def _final_state(problem: Problem, adjoint: FixedStepAdjoint, init_state, struct
 
 
 @eqx.filter_custom_vjp
-def _solve(inputs, adjoint: FixedStepAdjoint):
+def _solve(inputs, way: Reversal | Checkpoints):
     problem, buffers = inputs
     return _outputs(problem, buffers, run(problem)[0])
 
@@ -230,23 +230,21 @@ def _outputs(problem: Problem, buffers, out):
 
 
 @_solve.def_fwd
-def _solve_fwd(perturbed, inputs, adjoint: FixedStepAdjoint):
+def _solve_fwd(perturbed, inputs, way: Reversal | Checkpoints):
     moved, (problem, buffers) = perturbed[0], inputs
-    fixed = moved.steps, moved.rows, moved.subs, moved.solver
-    if any(jtu.tree_leaves(fixed)):
+    if any(jtu.tree_leaves((moved.steps, moved.rows, moved.subs))):
         raise ValueError(
             "`FixedStepAdjoint` does not support derivatives with respect to times "
-            "(`t0`, `t1`, `dt0`, `ts`) or to the solver. Use "
-            "`diffrax.RecursiveCheckpointAdjoint()` instead."
+            "(`t0`, `t1`, `dt0`, `ts`). Use `diffrax.RecursiveCheckpointAdjoint()` "
+            "instead."
         )
-    keep, _ = kept_steps(adjoint, problem)
-    out, trace = run(problem, keep)
+    out, trace = run(problem, way.places(problem))
     return _outputs(problem, buffers, out), trace
 
 
 @_solve.def_bwd
-def _solve_bwd(trace, bars, perturbed, inputs, adjoint: FixedStepAdjoint):
-    (problem, buffers), moved = inputs, perturbed[0]
+def _solve_bwd(trace, bars, perturbed, inputs, way: Reversal | Checkpoints):
+    problem, buffers = inputs
     (_, carry_bar), saved_bars, *_ = bars
     zeros = lambda like, bar: jtu.tree_map(
         lambda x, b: jnp.zeros_like(x) if b is None else b,
@@ -256,10 +254,12 @@ def _solve_bwd(trace, bars, perturbed, inputs, adjoint: FixedStepAdjoint):
     saved_bars = [
         zeros(ys, bar[1]) for (_, ys), bar in zip(buffers, saved_bars, strict=True)
     ]
-    wanted = moved.system, moved.fns
-    backward = Backward(problem, trace, wanted, (saved_bars, carry_bar))
-    at = pull_back(adjoint, backward)
+    backward = Backward(problem, trace, perturbed[0].functions, saved_bars, carry_bar)
+    at = way.pull_back(backward)
     none = lambda tree: jtu.tree_map(lambda _: None, tree)
-    where = lambda x: (x.system, x.fns, x.start)
-    gradient = eqx.tree_at(where, none(problem), (*at.gradient, at.bar), is_leaf=_none)
+    where = lambda x: (x.functions, x.start)
+    gradient = eqx.tree_at(where, none(problem), (at.gradient, at.bar), is_leaf=_none)
     return gradient, none(buffers)
+
+
+_none = lambda x: x is None

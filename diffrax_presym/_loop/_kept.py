@@ -1,34 +1,125 @@
 """Which states of a solve are kept for its gradient, and the way back between them."""
 
 import math
-from typing import Any
 
 import equinox as eqx
+import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Bool, PyTree
 
 from .. import _tree as tree
-from ._backward import Backward, Position
-from ._run import Problem
+from ._backward import Backward, BackwardState
+from ._problem import Problem
 
 
 # The least number of steps between two kept states, of a gradient by reversal.
 _APART = 16
+_NOT_RECOMPUTED = (
+    "`FixedStepAdjoint` recomputed the states of this solve with an error beyond its "
+    "`tol`: damping or instability amplifies rounding backwards in time. Keep more "
+    "states, `FixedStepAdjoint(checkpoints=...)`: if there are as many as steps, "
+    'nothing is recomputed. Or write `FixedStepAdjoint("checkpoints")`. With '
+    "`throw=False`, and for members of a batch, the gradient is NaN instead."
+)
 
 
-def limit(adjoint: Any, y: PyTree) -> tuple[float, float]:
-    """The largest allowed error of a recomputed state, and that of rounding."""
-    eps = float(max(jnp.finfo(x.dtype).eps for x in jtu.tree_leaves(y)))
-    return eps ** (2 / 3) if adjoint.tol is None else adjoint.tol, eps
+class Reversal(eqx.Module):
+    """By running the scheme backwards between at most so many kept states."""
+
+    most: int = eqx.field(static=True)
+    tol: float | None
+    # `None`: an error, but NaN for the members of a batch.
+    throw: bool | None = eqx.field(static=True)
+
+    def limit(self, y: PyTree) -> tuple[float, float]:
+        """The largest allowed error of a recomputed state, and that of rounding."""
+        eps = float(max(jnp.finfo(x.dtype).eps for x in jtu.tree_leaves(y)))
+        return eps ** (2 / 3) if self.tol is None else self.tol, eps
+
+    def places(self, problem: Problem) -> Array:
+        """The steps whose starting states are kept, in order; those that are not are
+        after the last step."""
+        parts, most, last = -(-problem.last // _APART), self.most + 1, problem.last
+        if problem.growth is not None:
+            # Each part may amplify rounding up to the limit.
+            allowed, eps = self.limit(problem.start[0])
+            needed = 2 * problem.growth / max(math.log(allowed / eps), 1)
+            # Infinite or undefined growth needs as many as there are.
+            needed = jnp.where(needed < most, needed, most)
+            parts = jnp.maximum(parts, jnp.ceil(needed).astype(parts.dtype))
+        parts = jnp.clip(parts, 1, most)
+        return _until(last, jnp.arange(most) * -(-last // parts))
+
+    def pull_back(self, backward: Backward) -> BackwardState:
+        problem, trace = backward.problem, backward.trace
+        places, undo = self.places(problem), problem.undo
+        assert undo is not None
+        at, pulls = backward.end()
+        # Positions and momenta are compared in units of their largest values. The
+        # solver state may be pure rounding, and is not compared.
+        units = jtu.tree_map(
+            lambda x, y: jnp.maximum(tree.largest(x), tree.largest(y)),
+            *(problem.start[0], at.point[0]),
+        )
+
+        def size(y):
+            scaled = jtu.tree_map(
+                lambda x, u: (tree.largest(x) / jnp.where(u > 0, u, 1)).astype(float),
+                *(y, units),
+            )
+            return jtu.tree_reduce(jnp.maximum, scaled)
+
+        def part(x):
+            at, worst, j = x
+            j, end = j - 1, at.point[0]
+            first, known = places[j], jtu.tree_map(lambda x: x[j], trace.kept)
+            # A kept state is the start of its step, which need not be inverted.
+            inverted = lambda n, point: lax.cond(
+                n == first, lambda: known, lambda: undo(n, point)
+            )
+            at = backward.back_to(at, pulls, first, inverted)
+            miss = size(tree.sub(*at.ends))
+            largest = jnp.maximum(size(known[0]), size(end))
+            miss = miss / jnp.where(largest > 0, largest, 1)  # at rest at the origin
+            return at, jnp.maximum(worst, miss), j
+
+        parts = jnp.maximum(jnp.sum(places < trace.n), 1)
+        zero = jnp.zeros_like(size(at.point[0]))
+        at, miss, _ = lax.while_loop(lambda x: x[2] > 0, part, (at, zero, parts))
+        at = backward.start(at)
+        # A solve that diverged has a gradient of NaN anyway.
+        missed = ~(miss <= self.limit(at.point[0])[0]) & tree.all_finite(trace.end[0])
+        if self.throw is None:
+            missed = _error_unless_batched(missed)
+        elif self.throw:
+            missed = eqx.error_if(missed, missed, _NOT_RECOMPUTED)
+        nan = lambda x: jnp.where(missed, jnp.nan, x)
+        where = lambda at: (at.gradient, at.bar)
+        return eqx.tree_at(where, at, jtu.tree_map(nan, where(at)))
 
 
-def kept_steps(adjoint: Any, problem: Problem) -> tuple[Array, Any]:
-    """The steps whose starting states are kept, in order; those that are not are
-    after the last step. And the number of steps between them, if it is known."""
-    if adjoint.gradient == "checkpoints":
-        most = problem.max_steps
+@jax.custom_batching.custom_vmap
+def _error_unless_batched(missed: Bool[Array, ""]) -> Bool[Array, ""]:
+    return eqx.error_if(missed, missed, _NOT_RECOMPUTED)
+
+
+@_error_unless_batched.def_vmap
+def _(axis_size, in_batched, missed):
+    return missed, True
+
+
+class Checkpoints(eqx.Module):
+    """By computing the steps again from kept states."""
+
+    max_steps: int | None = eqx.field(static=True)
+    number: int | None = eqx.field(static=True)  # of states to keep
+
+    @property
+    def length(self) -> int:
+        """The number of steps between two kept states."""
+        most = self.max_steps
         if most is None:
             raise ValueError(
                 "A gradient by checkpoints, the default of `FixedStepAdjoint` for a "
@@ -36,126 +127,43 @@ def kept_steps(adjoint: Any, problem: Problem) -> tuple[Array, Any]:
                 "memory for. Pass `diffeqsolve(..., max_steps=...)`, or use a scheme "
                 'with an inverse and `FixedStepAdjoint("reversal")`.'
             )
-        number = adjoint.checkpoints
-        parts = math.isqrt(most) if number is None else number + 1
-        length = max(-(-most // max(parts, 1)), 1)
-        places = jnp.arange(max(-(-most // length), 1)) * length
-        return _places(places, problem.last), length
-    most = (128 if adjoint.checkpoints is None else adjoint.checkpoints) + 1
-    first, system = _first_invertible(problem), problem.system
-    steps = problem.last - first
-    parts = -(-steps // _APART)
-    if system.friction is not None:
-        # Each part may amplify rounding up to the limit.
-        t0, t1 = (system.time(problem.steps.time(n)) for n in (first, problem.last))
-        allowed, eps = limit(adjoint, problem.start[0])
-        growth = system.friction.growth(t0, t1 - t0)
-        needed = 2 * growth / max(math.log(allowed / eps), 1)
-        # Infinite or undefined growth needs as many as there are.
-        needed = jnp.where(needed < most, needed, most)
-        parts = jnp.maximum(parts, jnp.ceil(needed).astype(parts.dtype))
-    parts = jnp.clip(parts, 1, most)
-    places = first + jnp.arange(most) * -(-steps // parts)
-    return _places(places, problem.last), None
+        parts = math.isqrt(most) if self.number is None else self.number + 1
+        return max(-(-most // max(parts, 1)), 1)
+
+    def places(self, problem: Problem) -> Array:
+        length = self.length
+        number = max(-(-(self.max_steps or 0) // length), 1)
+        return _until(problem.last, jnp.arange(number) * length)
+
+    def pull_back(self, backward: Backward) -> BackwardState:
+        places, length = self.places(backward.problem), self.length
+
+        def part(x):
+            at, j = x
+            j = j - 1
+            first = places[j]
+            known = jtu.tree_map(lambda x: x[j], backward.trace.kept)
+            stack = lambda x: jnp.broadcast_to(x, (length, *jnp.shape(x)))
+
+            def again(n, x):
+                point, points = x
+                point = backward.problem.functions.step(n, point)[0]
+                put = lambda xs, x: lax.dynamic_update_index_in_dim(
+                    xs, x, n + 1 - first, 0
+                )
+                return point, jtu.tree_map(put, points, point)
+
+            begin = known, jtu.tree_map(stack, known)
+            _, points = lax.fori_loop(first, at.n - 1, again, begin)
+            start = lambda n, _: jtu.tree_map(lambda x: x[n - first], points)
+            return backward.back_to(at, pulls, first, start), j
+
+        at, pulls = backward.end()
+        parts = jnp.maximum(jnp.sum(places < backward.trace.n), 1)
+        at, _ = lax.while_loop(lambda x: x[1] > 0, part, (at, parts))
+        return backward.start(at)
 
 
-def pull_back(adjoint: Any, backward: Backward) -> Position:
-    places, length = kept_steps(adjoint, backward.problem)
-    if length is None:
-        return _by_reversal(adjoint, backward, places)
-    return _by_checkpoints(backward, places, length)
-
-
-def _by_reversal(adjoint: Any, backward: Backward, places: Array) -> Position:
-    problem, trace = backward.problem, backward.trace
-    at, pulls = backward.end()
-    # Positions and momenta are compared in units of their largest values. The
-    # solver state may be pure rounding, and is not compared.
-    units = jtu.tree_map(
-        lambda x, y: jnp.maximum(tree.largest(x), tree.largest(y)),
-        *(problem.start[0], at.point[0]),
-    )
-
-    def size(y):
-        scaled = jtu.tree_map(
-            lambda x, u: (tree.largest(x) / jnp.where(u > 0, u, 1)).astype(float),
-            *(y, units),
-        )
-        return jtu.tree_reduce(jnp.maximum, scaled)
-
-    def part(x):
-        at, worst, j = x
-        j, end = j - 1, at.point[0]
-        known = jtu.tree_map(lambda x: x[j], trace.kept)
-        at = backward.back_to(at, pulls, places[j], lambda n: None)
-        miss = size(tree.sub(at.point[0], known[0]))
-        largest = jnp.maximum(size(known[0]), size(end))
-        miss = miss / jnp.where(largest > 0, largest, 1)  # at rest at the origin
-        at = eqx.tree_at(lambda at: at.point, at, known)
-        return at, jnp.maximum(worst, miss), j
-
-    parts = jnp.maximum(jnp.sum(places < trace.n), 1)
-    zero = jnp.zeros_like(size(at.point[0]))
-    at, miss, _ = lax.while_loop(lambda x: x[2] > 0, part, (at, zero, parts))
-    if _is_singular(problem) is not None:
-        # The first step cannot be inverted, and is pulled back from its start.
-        redo = lambda at: backward.step(at, problem.start)
-        at = lax.cond((places[0] > 0) & (at.n > 0), redo, lambda at: at, at)
-        at = backward.back_to(at, pulls, jnp.asarray(0), lambda n: None)
-    at = backward.start(at)
-    # A solve that diverged has a gradient of NaN anyway.
-    missed = ~(miss <= limit(adjoint, at.point[0])[0]) & tree.all_finite(trace.end[0])
-    return eqx.error_if(
-        at,
-        missed,
-        "`FixedStepAdjoint` recomputed the states of this solve with an error "
-        "beyond its `tol`: damping or instability amplifies rounding backwards in "
-        "time. Keep more states, `FixedStepAdjoint(checkpoints=...)`, or write "
-        '`FixedStepAdjoint("checkpoints")`.',
-    )
-
-
-def _places(places: Array, last: Array) -> Array:
+def _until(last: Array, places: Array) -> Array:
+    """The places before the last step; the others are after it, but for the first."""
     return jnp.where((places < last) | (jnp.arange(len(places)) == 0), places, last + 1)
-
-
-def _by_checkpoints(backward: Backward, places: Array, length: int) -> Position:
-    def part(x):
-        at, j = x
-        j = j - 1
-        first = places[j]
-        known = jtu.tree_map(lambda x: x[j], backward.trace.kept)
-        stack = lambda x: jnp.broadcast_to(x, (length, *jnp.shape(x)))
-
-        def again(n, x):
-            point, points = x
-            point = backward.advance(n, point)
-            put = lambda xs, x: lax.dynamic_update_index_in_dim(xs, x, n + 1 - first, 0)
-            return point, jtu.tree_map(put, points, point)
-
-        begin = known, jtu.tree_map(stack, known)
-        _, points = lax.fori_loop(first, at.n - 1, again, begin)
-        start = lambda n: jtu.tree_map(lambda x: x[n - first], points)
-        return backward.back_to(at, pulls, first, start), j
-
-    at, pulls = backward.end()
-    parts = jnp.maximum(jnp.sum(places < backward.trace.n), 1)
-    at, _ = lax.while_loop(lambda x: x[1] > 0, part, (at, parts))
-    return backward.start(at)
-
-
-def _is_singular(problem: Problem) -> Array | None:
-    """Whether friction is infinite at the start; `None` if it never is."""
-    friction, system = problem.system.friction, problem.system
-    if friction is None:
-        return None
-    return friction.is_singular(system.time(problem.steps.t0))
-
-
-def _first_invertible(problem: Problem) -> Array:
-    """The first step that can be inverted: one from a singularity of the friction loses
-    `p`."""
-    singular = _is_singular(problem)
-    if singular is None:
-        return jnp.asarray(0)
-    return jnp.where(singular & (problem.last > 0), 1, 0)

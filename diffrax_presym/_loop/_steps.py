@@ -15,6 +15,11 @@ from .._system._bound import System
 
 # More than any solve takes, in integers of either precision.
 _MOST_STEPS = 2**30
+_OTHER_ENDS = (
+    "The first and the last time of `diffrax.StepTo(ts)` must be `t0` and `t1` of the "
+    "solve. Write `StepTo(jnp.concatenate([t0, ts, t1]))`, or use "
+    "`StepsBetween(ts)`, which ignores times that are not between the two."
+)
 
 
 class StepsBetween(dfx.AbstractStepSizeController):
@@ -94,7 +99,8 @@ class Steps(eqx.Module):
     def __init__(self, controller: dfx.AbstractStepSizeController, t0, t1, dt0):
         self.t0, self.t1, self.ts = t0, t1, None
         if isinstance(controller, dfx.StepTo):
-            self.ts = controller.ts
+            ends = (controller.ts[0] == t0) & (controller.ts[-1] == t1)
+            self.ts = eqx.error_if(controller.ts, ~ends, _OTHER_ENDS)
             self.total = jnp.asarray(len(controller.ts) - 1)
             self.starts, self.first = t0[None], jnp.zeros(1, int)
             self.length = jnp.zeros_like(self.starts)
@@ -108,6 +114,8 @@ class Steps(eqx.Module):
         # As few equal steps as are not longer than `dt0`, but for rounding.
         eps, most = float(jnp.finfo(t0.dtype).eps), _MOST_STEPS
         numbers = jnp.ceil(spans / dt0 * (1 - 2 * eps))
+        # One step if `dt0` is infinite.
+        numbers = jnp.where(spans > 0, jnp.maximum(numbers, 1), numbers)
         finite = jnp.isfinite(numbers)
         # A time that is not finite is never reached, with steps of the given length.
         counts = jnp.where(finite, jnp.where(finite, numbers, 0).astype(int), most)
@@ -175,7 +183,9 @@ class Rows(eqx.Module):
     """What one of `SaveAt(subs=...)` saves between the ends of a solve, in order."""
 
     time: Float[Array, " rows"]
-    stop: Int[Array, " rows"]  # the step from whose start it is computed
+    # The step from whose start it is computed; -1 if its time is not a number, a gap in
+    # measured times, for which nothing is saved.
+    stop: Int[Array, " rows"]
     inside: Bool[Array, " rows"]  # whether it is within that step
     of_ts: Bool[Array, " rows"]  # whether it is of `ts`
     may_be_inside: bool = eqx.field(static=True)
@@ -185,8 +195,9 @@ class Rows(eqx.Module):
         self.may_be_inside = sub.ts is not None and len(sub.ts) > 0
         if sub.ts is not None:
             times.append(sub.ts)
-            for known, x in zip((stops, insides), steps.locate(sub.ts), strict=True):
-                known.append(x)
+            gap, (stop, inside) = jnp.isnan(sub.ts), steps.locate(sub.ts)
+            stops.append(jnp.where(gap, -1, stop))
+            insides.append(inside & ~gap)
         number = 0 if sub.ts is None else len(sub.ts)
         if sub.steps:
             assert max_steps is not None  # as Diffrax has checked
@@ -209,3 +220,7 @@ class Rows(eqx.Module):
     def reached(self, n: Int[Array, ""]) -> Bool[Array, " rows"]:
         """Which rows are known after `n` steps."""
         return self.stop + jnp.where(self.inside, 1, 0) <= n
+
+    def taken(self, n: Int[Array, ""]) -> Bool[Array, " rows"]:
+        """Which of these have a value."""
+        return self.reached(n) & (self.stop >= 0)

@@ -2,8 +2,7 @@
 
 A move maps the state within a step over a span of time, in two phases: what depends on
 time alone is prepared, for all stages at once, and what touches the state is applied.
-`Stages` are sequences of moves. A step, its inverse and its vector-Jacobian product all
-traverse the same list.
+`Stages` are sequences of moves. A step and its inverse traverse the same list.
 """
 
 import abc
@@ -20,7 +19,6 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .. import _tree as tree
 from .._friction._linear import Effects
 from .._numbers import cast_to
 from .._system._bound import System
@@ -76,6 +74,11 @@ class AbstractMove(eqx.Module):
         `jax.vmap`."""
         return None
 
+    def is_autonomous(self, system: System) -> bool:
+        """Whether what is prepared depends on the length of the span alone, so that
+        stages and steps of one length share it. By default only if it is nothing."""
+        return type(self).prepare is AbstractMove.prepare
+
 
 class Inverse(AbstractMove):
     """The inverse of a move, as a move."""
@@ -84,6 +87,9 @@ class Inverse(AbstractMove):
 
     def prepare(self, system: System, span: Span) -> PyTree:
         return self.move.prepare(system, span)
+
+    def is_autonomous(self, system: System) -> bool:
+        return self.move.is_autonomous(system)
 
     def apply(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
         return self.move.undo(system, span, data, stage)
@@ -123,6 +129,13 @@ def inverse(moves: Moves) -> Moves:
     return moves.move if isinstance(moves, Inverse) else Inverse(moves)
 
 
+def is_autonomous(moves: Moves, system: System) -> bool:
+    """Whether what the moves prepare depends on the length of a span alone."""
+    if not isinstance(moves, Stages):
+        return moves.is_autonomous(system)
+    return all(is_autonomous(move, system) for move in moves.moves)
+
+
 def prepare(moves: Moves, system: System, span: Span, backward: bool = False) -> PyTree:
     """What all moves need of time alone, for a step: of the inverses if `backward`."""
     if not isinstance(moves, Stages):
@@ -130,7 +143,7 @@ def prepare(moves: Moves, system: System, span: Span, backward: bool = False) ->
 
     def column(move: Moves, rows: np.ndarray) -> PyTree:
         which = np.arange(len(rows))
-        if system.prepares_once:  # what is prepared depends on the length alone
+        if is_autonomous(move, system):
             lengths = np.round(rows[:, 2], 15)
             _, first, which = np.unique(lengths, return_index=True, return_inverse=True)
             rows = rows[first]
@@ -183,98 +196,43 @@ def forward(
     moves: Moves, system: System, span: Span, data: PyTree, stage: Stage
 ) -> Outcome:
     """Apply all moves, in order, with what was prepared for them."""
-    act = lambda move, span, data, stage: move.apply(system, span, data, stage)
-    return _walk(act, moves, span, data, stage)[:2]
+    act = lambda move, *args: move.apply(system, *args)
+    return _walk(act, moves, span, data, stage)
 
 
-def vjp(
-    moves: Moves,
-    system: System,
-    wanted: PyTree,
-    span: Span,
-    data: PyTree,
-    start: Stage,
-    bar: Stage,
-) -> tuple[PyTree, PyTree, Stage]:
-    """The vector-Jacobian product of moves, from the state at their start.
-
-    Returns the cotangents of the `wanted` leaves of the system, of what was prepared,
-    and of that state.
-    """
-    moved, fixed = eqx.partition(system, wanted)
-    redo = lambda moved, data, x: forward(
-        moves, eqx.combine(moved, fixed), span, data, x
-    )[0]
-    return jax.vjp(redo, moved, data, start)[1](bar)
-
-
-def vjp_step(
-    moves: Moves,
-    system: System,
-    wanted: PyTree,
-    span: Span,
-    both: tuple[PyTree, PyTree],
-    end: Stage,
-    bar: Stage,
-) -> tuple[Stage, PyTree, PyTree, Stage]:
-    """Invert all moves, and compute their vector-Jacobian product, move by move.
-
-    `both` is what was prepared for the moves, and for their inverses. Returns the state
-    at the start, and the cotangents of the `wanted` leaves of the system, of what was
-    prepared for the moves, and of that state.
-    """
-
-    def back(move: AbstractMove, span: Span, both: PyTree, x: PyTree):
-        end, gradient, bar = x
-        data, back = both
-        start, _ = move.undo(system, span.reversed, back, end)
-        more, prepared, bar = vjp(move, system, wanted, span, data, start, bar)
-        return (start, tree.sum(gradient, more), bar), None, prepared
-
-    state = end, tree.zeros(eqx.filter(system, wanted)), bar
-    (start, gradient, bar), _, prepared = _walk(
-        back, moves, span, both, state, reverse=True
-    )
-    return start, gradient, prepared, bar
+def backward(
+    moves: Moves, system: System, span: Span, data: PyTree, stage: Stage
+) -> Stage:
+    """Invert all moves, in reverse order, with what was prepared for that."""
+    act = lambda move, span, *args: move.undo(system, span.reversed, *args)
+    return _walk(act, moves, span, data, stage, reverse=True)[0]
 
 
 def _walk(
-    act: Callable,
+    act: Callable[..., Outcome],
     moves: Moves,
     span: Span,
     data: PyTree,
-    state: PyTree,
+    state: Stage,
     reverse: bool = False,
-) -> tuple[PyTree, Result, PyTree]:
-    """Apply `act` to each move, its part of the span and its data, in order.
-
-    `act` returns the new state, a result or `None`, and something of the form of the
-    data or `None`, which is returned for all moves.
-    """
+) -> Outcome:
+    """Apply `act` to each move, its part of the span and its data, in order."""
     if not isinstance(moves, Stages):
-        state, result, *output = act(moves, span, data, state)
-        return state, result, output[0] if output else None
+        return act(moves, span, data, state)
     order = slice(None, None, -1 if reverse else 1)
-    number = len(moves.moves)
-    # `data` is a list with an entry for each move, or a pair of such lists.
-    paired = isinstance(data, tuple)
-    column = lambda i: tuple(x[i] for x in data) if paired else data[i]
-    columns = [column(i) for i in range(number)]
+    each = list(enumerate(moves.moves))[order]
 
-    def row(state: PyTree, parts, data):
-        result, outputs = None, [None] * number
-        for i in range(number)[order]:
+    def row(state: Stage, parts, data) -> Outcome:
+        result = None
+        for i, move in each:
             part = span.part(*parts[i])
-            state, more, outputs[i] = _walk(
-                act, moves.moves[i], part, data[i], state, reverse
-            )
+            state, more = _walk(act, move, part, data[i], state, reverse)
             result = first_failure(result, more)
-        return state, result, outputs
+        return state, result
 
     if len(moves.table) == 1:
-        first = jtu.tree_map(lambda x: x[0], columns)
-        state, result, outputs = row(state, moves.table[0].tolist(), first)
-        return state, result, jtu.tree_map(lambda x: jnp.expand_dims(x, 0), outputs)
+        first = jtu.tree_map(lambda x: x[0], data)
+        return row(state, moves.table[0].tolist(), first)
     # Moves, three numbers, rows. Each number once: a loop over few arrays is faster.
     numbers = np.moveaxis(moves.table, 0, -1)
     flat, which = np.unique(
@@ -284,20 +242,16 @@ def _walk(
 
     def body(state, x):
         flat, data = x
-        parts = [[flat[i] for i in move] for move in which]
-        state, result, outputs = row(state, parts, data)
-        return state, (result, outputs)
+        return row(state, [[flat[i] for i in move] for move in which], data)
 
-    rows = tuple(cast_to(x, span.h) for x in flat), columns
+    rows = tuple(cast_to(x, span.h) for x in flat), data
     unroll = 1 if cheap_iterations() else True
-    state, (results, outputs) = lax.scan(
-        body, state, rows, reverse=reverse, unroll=unroll
-    )
+    state, results = lax.scan(body, state, rows, reverse=reverse, unroll=unroll)
     if results is not None:
         # The first stage that failed, or any if none did.
         failed = jnp.argmax(results != dfx.RESULTS.successful)
         results = jtu.tree_map(lambda x: x[failed], results)
-    return state, results, outputs
+    return state, results
 
 
 def cheap_iterations() -> bool:

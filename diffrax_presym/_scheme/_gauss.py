@@ -64,6 +64,9 @@ class Collocation(AbstractMove):
         parts = map(rows, [0, 1, 2, inwards, outwards])
         return Frames(*parts)
 
+    def is_autonomous(self, system: System) -> bool:
+        return system.prepares_once
+
     def apply(
         self, system: System, span: Span, data: Frames | None, stage: Stage
     ) -> Outcome:

@@ -34,6 +34,9 @@ class Drift(AbstractMove):
         split = system.split(self.kind)
         return split.prepare(system, span.t0, span.h, self.order)
 
+    def is_autonomous(self, system: System) -> bool:
+        return system.prepares_once
+
     def apply(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
         (y, carry), split = stage, system.split(self.kind)
         return (split.drift(system, span.t0, span.h, data, y), carry), None
@@ -71,6 +74,9 @@ class FrozenDrift(AbstractMove):
 
     def prepare(self, system: System, span: Span) -> PyTree:
         return system.prepare_decay(span.t0, span.h)
+
+    def is_autonomous(self, system: System) -> bool:
+        return system.prepares_once
 
     def apply(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
         y, carry = stage

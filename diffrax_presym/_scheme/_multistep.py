@@ -87,6 +87,9 @@ class Multistep(AbstractMove):
         decay = system.split("shared").prepare(system, span.t0, span.h, self.order)
         return decay, prepare(_ONE_STEP.scheme(system).moves, system, span)
 
+    def is_autonomous(self, system: System) -> bool:
+        return system.prepares_once
+
     def apply(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
         (y, old), (t0, t1, h), table = stage, span, _TABLES[self.order]
         (decay, data), split = data, system.split("shared")

@@ -52,6 +52,9 @@ class MoveFrames(AbstractMove):
     def prepare(self, system: System, span: Span) -> PyTree:
         return system.prepare_decay(span.t0, span.h)
 
+    def is_autonomous(self, system: System) -> bool:
+        return system.prepares_once
+
     def apply(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
         y, (copy, field) = stage
         return (system.decay(data, y), (system.decay(data, copy), field)), None
@@ -70,6 +73,9 @@ class Coupling(AbstractMove):
         if self.strength is None:
             return jnp.copysign(cast_to(3 * np.pi / 8, h), h)
         return 2 * cast_to(self.strength, h) * h
+
+    def is_autonomous(self, system: System) -> bool:
+        return True
 
     def apply(self, system: System, span: Span, data: Array, stage: Stage) -> Outcome:
         y, (copy, field) = stage

@@ -31,9 +31,9 @@ class Hamiltonian(AbstractSystem):
     """
 
     fn: Callable
-    friction: tuple[AbstractFriction, ...]
+    friction: tuple[AbstractFriction, ...] | None  # Equinox fails on `()` in a term
     external: Callable | None
-    known: tuple[AbstractSplit, ...]
+    known: tuple[AbstractSplit, ...] | None
 
     def __init__(self, energy, friction=None, *, force=None, splits=()):
         r"""**Arguments:**
@@ -58,7 +58,7 @@ class Hamiltonian(AbstractSystem):
         check_callable(energy, "energy", "E(t, q, p, args)")
         check_callable(force, "force", "f(t, q, v, args)", optional=True)
         self.fn = energy
-        self.friction = as_laws(friction)
+        self.friction = as_laws(friction) or None
         self.external = force
         sequence = isinstance(splits, tuple | list)
         if not sequence or not all(isinstance(x, AbstractSplit) for x in splits):
@@ -66,17 +66,19 @@ class Hamiltonian(AbstractSystem):
                 "`Hamiltonian(splits=...)` must be a tuple of `extend.AbstractSplit`, "
                 f"but got {splits!r}."
             )
-        self.known = tuple(splits)
+        self.known = tuple(splits) or None
         _ = self.parts  # An error if a law does not fit the system.
 
     @property
     def laws(self) -> tuple[AbstractFriction, ...]:
-        return self.friction
+        return self.friction or ()
 
     @property
     def splits(self) -> tuple[AbstractSplit, ...]:
         _, *other = self.parts
-        return () if any(other) or self.external is not None else self.known
+        if any(other) or self.external is not None:
+            return ()
+        return self.known or ()
 
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         return scalar_fn(self.fn, "The energy")(t, q, p, args)

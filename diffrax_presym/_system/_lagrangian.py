@@ -70,7 +70,7 @@ class LagrangianSystem(AbstractSystem):
 
     mass_fn: Callable
     potential: Callable
-    friction: tuple[AbstractFriction, ...]
+    friction: tuple[AbstractFriction, ...] | None  # Equinox fails on `()` in a term
     external: Callable | None
 
     def __init__(self, mass_matrix, potential, friction=None, force=None):
@@ -102,13 +102,13 @@ class LagrangianSystem(AbstractSystem):
         check_callable(force, "force", "f(t, q, v, args)", optional=True)
         self.mass_fn = mass_matrix
         self.potential = potential
-        self.friction = as_laws(friction)
+        self.friction = as_laws(friction) or None
         self.external = force
         _ = self.parts  # An error if a law does not fit the system.
 
     @property
     def laws(self) -> tuple[AbstractFriction, ...]:
-        return self.friction
+        return self.friction or ()
 
     @property
     def mechanics(self) -> Mechanics:

@@ -67,7 +67,7 @@ class MechanicalSystem(AbstractSystem):
 
     kinetic: AbstractKinetic
     potential: AbstractPotential
-    friction: tuple[AbstractFriction, ...]
+    friction: tuple[AbstractFriction, ...] | None  # Equinox fails on `()` in a term
     external: Callable | None
 
     def __init__(self, kinetic, potential, friction=None, *, force=None):
@@ -96,13 +96,13 @@ class MechanicalSystem(AbstractSystem):
         self.potential = as_potential(potential)
         self.kinetic = as_kinetic(kinetic)
         check_callable(force, "force", "f(t, q, v, args)", optional=True)
-        self.friction = as_laws(friction)
+        self.friction = as_laws(friction) or None
         self.external = force
         _ = self.parts  # An error if a law does not fit the system.
 
     @property
     def laws(self) -> tuple[AbstractFriction, ...]:
-        return self.friction
+        return self.friction or ()
 
     @property
     def mechanics(self) -> Mechanics:
