@@ -1,6 +1,10 @@
 """What one needs to write systems, friction and schemes of one's own."""
 
-from ._friction._base import AbstractFriction as AbstractFriction
+from ._friction._base import (
+    AbstractFriction as AbstractFriction,
+    Mechanics as Mechanics,
+    Parts as Parts,
+)
 from ._friction._damping import Damping as Damping
 from ._friction._log_scale import AbstractLogScale as AbstractLogScale
 from ._interpolation import HermiteInterpolation as HermiteInterpolation
@@ -13,9 +17,8 @@ from ._scheme._engine import (
     Span as Span,
     Stages as Stages,
 )
-from ._system._base import (
-    AbstractSystem as AbstractSystem,
-)
+from ._scheme._moves import Drift as Drift, Kick as Kick
+from ._system._base import AbstractSystem as AbstractSystem
 from ._system._bound import System as System
 from ._system._kinetic import AbstractKinetic as AbstractKinetic
 from ._system._mirror import AbstractMirrorMap as AbstractMirrorMap

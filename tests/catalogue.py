@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
+import own
 import scipy.integrate
 from helpers import substeps
 from jax.flatten_util import ravel_pytree
@@ -78,6 +79,12 @@ def _energy(energy):
         return dps.Hamiltonian(energy, friction=laws, force=force)
 
     return build
+
+
+def _split(laws, force=None):
+    energy = lambda t, q, p, args: jnp.sum(p**2 / 2 + q**4 / 4)
+    splits = (own.QuarticSplit(),)
+    return dps.Hamiltonian(energy, friction=laws, force=force, splits=splits)
 
 
 def _one_law(make):
@@ -358,6 +365,10 @@ SYSTEMS = [
     System(
         *("force field", _mechanical(_quadratic(_MASS), dps.ForceField(_whirl))),
         *(_inverse(_MASS), _whirl_force, *_TWO, RATE, "all", _MASS),
+    ),
+    System(
+        *("own split", _split, _own, lambda t, q, p: -(q**3)),
+        *(*_TWO, frozenset({"any", "nystrom"}), "rates"),
     ),
 ]
 
@@ -647,6 +658,12 @@ FRICTION = [
         needs="bodies",
     ),
     Friction(
+        *("own drag", _same(own.CubicDrag())),
+        lambda s, t, q, p, v: _drag_numpy(s, v, 0.3, 3.0),
+        "drag",
+        needs="bodies",
+    ),
+    Friction(
         "[matrix, drag]",
         _some(lambda s: [_viscous(s), dps.Drag(0.4)]),
         _sum(_by_matrix, lambda s, t, q, p, v: _drag_numpy(s, v)),
@@ -720,6 +737,7 @@ SCHEMES = [
     Scheme("Strang", dps.Strang, 2, "any"),
     Scheme("Blanes-Moan 4", dps.BlanesMoan4, 4, "any"),
     Scheme("Blanes-Moan 6", dps.BlanesMoan6, 6, "any"),
+    Scheme("own moves", own.DrivenLeapfrog, 2, "any"),
     Scheme(*("Suzuki4 of Strang", lambda: dps.Suzuki4(dps.Strang()), 4, "any")),
     Scheme("RKN4", dps.BlanesMoanRKN4, 4, "nystrom"),
     Scheme("RKN6", dps.BlanesMoanRKN6, 6, "nystrom"),

@@ -22,11 +22,18 @@ DAMPING = "The damping"
 
 
 class Mechanics(NamedTuple):
-    """What friction needs to know of a system."""
+    """What friction needs to know of a system.
+
+    **Attributes:**
+
+    - `mass`: as in [`diffrax_presym.QuadraticKinetic`][]; `None` is one.
+    - `has_mass`: whether the mass is known.
+    - `mass_varies`: whether it depends on the positions, so that no drift is exact.
+    """
 
     mass: Any = None
     has_mass: bool = True
-    mass_varies: bool = False  # with the place, so that there are no exact drifts
+    mass_varies: bool = False
 
 
 class Linear(NamedTuple):
@@ -39,12 +46,24 @@ class Linear(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """What a law of friction, or several, add to the motion of a system."""
+    """What a law of friction, or several, add to the motion of a system: tuples of
+    laws, by where they act.
+
+    **Attributes:**
+
+    - `linear`: rates that depend on time alone, part of every drift.
+    - `local`: linear in the momentum, by place, part of every kick: each with `at(t, q,
+        args)`, which gives the rates at a place.
+    - `drags`: by the speed of bodies, part of every kick: each with `at(t, q, args)`,
+        the law at a place, and `decay(h, p, mass)`, the change of `p` by it alone over
+        a time `h`.
+    - `forces`: any other law, part of the force.
+    """
 
     linear: tuple[Linear, ...] = ()
-    local: tuple[Any, ...] = ()  # of `LocalFriction`, part of every kick
-    drags: tuple[Any, ...] = ()  # of `Drag`, part of every kick
-    forces: tuple[Any, ...] = ()  # part of the force alone
+    local: tuple[Any, ...] = ()
+    drags: tuple[Any, ...] = ()
+    forces: tuple[Any, ...] = ()
 
     def __add__(self, other: "Parts") -> "Parts":  # pyright: ignore
         both = zip(self, other, strict=True)

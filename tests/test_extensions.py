@@ -1,0 +1,51 @@
+"""Laws, splits and moves of the user; the catalogue combines them with the rest."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import own
+import pytest
+
+import diffrax_presym as dps
+from diffrax_presym import extend
+
+
+@pytest.mark.parametrize("gradient", [None, "reversal", "checkpoints"])
+def test_arrays_that_a_move_holds_are_differentiated(gradient):
+    """Against the same recursion in NumPy, differentiated by differences."""
+    spring = lambda t, q, args: args * jnp.sum(q**2) / 2
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), spring)
+    adjoint = dps.FixedStepAdjoint(gradient)
+    if gradient is None:
+        adjoint = dfx.RecursiveCheckpointAdjoint()
+
+    def end(k):
+        y0 = jnp.ones(1), jnp.zeros(1)
+        sol = dfx.diffeqsolve(
+            *(system, own.SpringLeapfrog(), 0.0, 2.0, 0.125, y0, k),
+            adjoint=adjoint,
+            max_steps=16,
+        )
+        assert sol.ys is not None
+        return sol.ys[0][0, 0]
+
+    def by_hand(k, q=1.0, p=0.0, h=0.125):
+        for _ in range(16):
+            q = q + h / 2 * p
+            p = p - h * k * q
+            q = q + h / 2 * p
+        return q
+
+    slope = (by_hand(1.3 + 1e-6) - by_hand(1.3 - 1e-6)) / 2e-6
+    np.testing.assert_allclose(jax.grad(end)(jnp.asarray(1.3)), slope, rtol=1e-8)
+
+
+def test_a_move_that_prepares_is_prepared_for_each_stage_by_default():
+    system = extend.System(
+        dps.MechanicalSystem(dps.QuadraticKinetic(), lambda t, q, args: jnp.sum(q)),
+        *(None, 1, (jnp.ones(1), jnp.ones(1))),
+    )
+    assert not own.DrivenKick().is_autonomous(system)
+    assert own.SpringKick(1.0).is_autonomous(system)
+    assert extend.Drift("any", 2).is_autonomous(system)
