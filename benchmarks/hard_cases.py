@@ -212,9 +212,7 @@ def kepler(quick):
         if drag is not None:
             system = mechanics(newton, dps.ConstantDamping(drag))
         record = lambda t, y, args, s=system: s.energy(t, y[0], y[1], args)
-        density = lambda epsilon, s=system: dps.StepDensityController(
-            s, epsilon, distance
-        )
+        density = lambda epsilon: dps.StepDensityController(epsilon, distance)
         runs = {
             "RKN6, density": (RKN6, density(0.25)),
             "leapfrog, density": (LEAPFROG, density(0.04)),
@@ -261,7 +259,7 @@ def encounters(quick):
         start = float(system.energy(ZERO, *y0, soft))
         cells = []
         for control, dt0 in (
-            (dps.StepDensityController(system, 0.04, distance), None),
+            (dps.StepDensityController(0.04, distance), None),
             (CONSTANT, 2 * np.pi / 4000),
         ):
             t1 = 20 * np.pi + 3
