@@ -63,6 +63,10 @@ def last(ys):
     return jax.tree.map(lambda y: y[-1], ys)
 
 
+def succeeds(sol):
+    return sol.result == dfx.RESULTS.successful
+
+
 def conic(a, low, x):
     """Time, position and velocity on an ellipse or, with a negative semi-major axis, a
     hyperbola of this pericentre, by the eccentric anomaly; on a parabola, `a = inf`, by
@@ -103,11 +107,9 @@ def test_close_encounters_are_right_or_fail(dtype, backwards):
     cast = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, dtype), tree)
 
     def one(epsilon, t1, y0):
-        controller = control(epsilon, DISTANCE)
-        options = dict(max_steps=4000, saveat=dfx.SaveAt(t1=True))
-        sol = solve(controller, dps.BlanesMoanRKN6(), 0 * t1, t1, y0, **options)
-        good = sol.result == dfx.RESULTS.successful
-        return last(sol.ys)[0], good, sol.stats["num_steps"]
+        run = partial(solve, control(epsilon, DISTANCE), dps.BlanesMoanRKN6())
+        sol = run(0 * t1, t1, y0, max_steps=4000)
+        return last(sol.ys)[0], succeeds(sol), sol.stats["num_steps"]
 
     batch = jax.vmap(jax.vmap(one, (0, None, None)), (None, 0, 0))
     q, good, steps = map(np.asarray, batch(*cast((EPSILONS, t1, y0))))
@@ -152,7 +154,7 @@ def test_three_bodies_from_rest():
         y0 = jnp.array(q0), jnp.zeros((3, 2))
         controller, solver = control(epsilon, density), dps.BlanesMoanRKN6()
         sol = solve(controller, solver, 0.0, 10.0, y0, system)
-        return last(sol.ys)[0], sol.result == dfx.RESULTS.successful
+        return last(sol.ys)[0], succeeds(sol)
 
     q, good = map(np.asarray, jax.vmap(one)(jnp.array([0.8, 0.4, 0.2, 0.1, 0.05])))
     assert list(good) == [False, False, True, True, True]
@@ -170,11 +172,10 @@ def test_a_solve_goes_back_the_way_it_came_and_past_its_start(density, sign):
     y0 = last(solve(CONTROL, LEAPFROG, 0.0, 0.7, Y0).ys)
     run = partial(solve, controller, LEAPFROG, saveat=ALL)
     there, before = (run(0.5, s * 1e3, y0, max_steps=n) for s in (sign, -sign))
-    state = controller.reverse(
-        there.ts[-1], last(there.ys), None, there.controller_state
-    )
+    t, y = there.ts[-1], last(there.ys)
+    state = controller.reverse(t, y, None, there.controller_state)
     back = run(
-        *(there.ts[-1], -sign * 1e3, last(there.ys)),
+        *(t, -sign * 1e3, y),
         max_steps=2 * n,
         dt0=-sign * controller.step_size(state),
         controller_state=state,
@@ -196,8 +197,8 @@ class Naive(dps.StepDensityController):
 
 def energy_means(controller):
     """Mean energy errors over the first and over the last tenth of 500 orbits."""
-    options = dict(saveat=STEPS, max_steps=50000)
-    sol = solve(controller, LEAPFROG, 0.0, 500 * PERIOD, Y0, **options)
+    run = partial(solve, saveat=STEPS, max_steps=50000)
+    sol = run(controller, LEAPFROG, 0.0, 500 * PERIOD, Y0)
     q, p = (np.asarray(y)[np.isfinite(sol.ts)] for y in sol.ys)
     error = np.sum(p**2, axis=1) / 2 - 1 / np.linalg.norm(q, axis=1) + 0.5
     part = len(error) // 10
@@ -323,14 +324,11 @@ def test_a_density_without_a_rate_at_the_start():
     # The norm has no derivative at zero.
     density = lambda t, y, args: 1 / (1 + jnp.linalg.norm(y[0]))
     rest = jnp.zeros(2), Y0[1]
-    sol = solve(control(0.05, density), LEAPFROG, 0.0, 1.0, rest, HARMONIC)
-    assert sol.result == dfx.RESULTS.successful
+    spring = lambda t, q, args: jnp.sum(q**2) / 2
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), spring)
+    sol = solve(control(0.05, density), LEAPFROG, 0.0, 1.0, rest, system)
+    assert succeeds(sol)
     assert_close(last(sol.ys)[0], Y0[1] * np.sin(1.0), 1e-3)
-
-
-HARMONIC = dps.MechanicalSystem(
-    dps.QuadraticKinetic(), lambda t, q, args: jnp.sum(q**2) / 2
-)
 
 
 WRONG: Any = 1.0
