@@ -63,7 +63,7 @@ def states(
         options["max_steps"] = MOST
     elif density is not None:
         epsilon, dt0 = dt0 / density(t0, y0, args), None
-        options["controller"] = dps.StepDensityController(term, epsilon, density)
+        options["controller"] = dps.StepDensityController(epsilon, density)
         options["max_steps"] = MOST
     elif isinstance(solver, dps.extend.AbstractPresymplecticSolver):
         options.setdefault("adjoint", dps.FixedStepAdjoint())

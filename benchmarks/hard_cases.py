@@ -212,9 +212,7 @@ def kepler(quick):
         if drag is not None:
             system = mechanics(newton, dps.ConstantDamping(drag))
         record = lambda t, y, args, s=system: s.energy(t, y[0], y[1], args)
-        density = lambda epsilon, s=system: dps.StepDensityController(
-            s, epsilon, distance
-        )
+        density = lambda epsilon: dps.StepDensityController(epsilon, distance)
         runs = {
             "RKN6, density": (RKN6, density(0.25)),
             "leapfrog, density": (LEAPFROG, density(0.04)),
@@ -261,7 +259,7 @@ def encounters(quick):
         start = float(system.energy(ZERO, *y0, soft))
         cells = []
         for control, dt0 in (
-            (dps.StepDensityController(system, 0.04, distance), None),
+            (dps.StepDensityController(0.04, distance), None),
             (CONSTANT, 2 * np.pi / 4000),
         ):
             t1 = 20 * np.pi + 3
@@ -270,6 +268,69 @@ def encounters(quick):
             error = float(system.energy(ZERO, q, p, soft)) - start
             cells += [int(sol.stats["num_steps"]), abs(error)]
         table.row(str(e), str(soft or 0), *cells)
+
+
+def kepler_cases(lows):
+    """Close encounters of two bodies: name, initial state, time, and the position at
+    the end in closed form. Without cancellation at the pericentre."""
+    starts = {"apocentre": np.pi, "pericentre": 0.0, "outwards": 2.0, "inwards": -0.3}
+    for low in lows:
+        b = (low * (2 - low)) ** 0.5
+        for name, x in starts.items():
+            versed = 2 * np.sin(x / 2) ** 2
+            r = low + (1 - low) * versed
+            q, p = (low - versed, b * np.sin(x)), (-np.sin(x) / r, b * np.cos(x) / r)
+            yield f"1 - e = {low:g}, {name}", (q, p), 2 * np.pi, q
+    # Fly-bys are symmetric about the axis; `x` is half of the true anomaly's tangent.
+    low, x = 1e-3, 40.0
+    q, p = (low * (1 - x**2), -2 * low * x), np.array([x, 1]) * (2 / low) ** 0.5
+    t1 = 2 * (2 * low**3) ** 0.5 * (x + x**3 / 3)
+    yield "parabola", (q, p / (1 + x**2)), t1, (q[0], -q[1])
+    x, e = 1.5, 1 + low
+    b, versed = (low * (2 + low)) ** 0.5, 2 * np.sinh(x / 2) ** 2
+    q, p = (low - versed, -b * np.sinh(x)), np.array([np.sinh(x), b * np.cosh(x)])
+    t1 = 2 * (e * np.sinh(x) - x)
+    yield "hyperbola", (q, p / (low + e * versed)), t1, (q[0], -q[1])
+
+
+def infalls(quick):
+    """Steps by a density where bodies come close, for many `epsilon`."""
+    epsilons = (0.3, 0.2, 0.1, 0.05, 0.02, 0.01)
+    table = Table(
+        "   close encounters, BlanesMoanRKN6, steps by a density: steps at epsilon = "
+        "0.1,\n   and for each epsilon the error of the position, of three bodies that "
+        "of the energy",
+        *("case:<25", "steps:>6d", *(f"{x:g}:>8.0e" for x in epsilons)),
+    )
+
+    def row(name, system, density, t1, y0, error):
+        cells, steps = [], {}
+        y0 = jax.tree.map(jnp.asarray, y0)
+        for x in epsilons:
+            control = dps.StepDensityController(jnp.array(x), density)
+            problem = system, RKN6, ZERO, jnp.array(t1), None, y0
+            sol, y = end(*problem, controller=control)
+            steps[x] = int(sol.stats["num_steps"])
+            cells.append(error(*y) if successful(sol) else "failed")
+        table.row(name, steps[0.1], *cells)
+
+    one = mechanics(newton)
+    for name, y0, t1, exact in kepler_cases(10.0 ** -np.arange(1, 3 if quick else 6)):
+        y0 = tuple(map(jnp.array, y0))
+        error = lambda q, p, exact=exact: np.linalg.norm(q - np.array(exact))
+        row(name, one, distance, t1, y0, error)
+    distances = lambda q: jnp.linalg.norm(q - jnp.roll(q, 1, axis=0), axis=1)
+    masses = jnp.array([[3.0, 3.0], [4.0, 4.0], [5.0, 5.0]])
+    three = dps.MechanicalSystem(
+        dps.QuadraticKinetic(masses),
+        lambda t, q, args: -jnp.sum(jnp.array([15.0, 12.0, 20.0]) / distances(q)),
+    )
+    density = lambda t, y, args: jnp.sum(distances(y[0]) ** -3) ** -0.5
+    y0 = jnp.array([[1.0, 3.0], [-2.0, -1.0], [1.0, -1.0]]), jnp.zeros((3, 2))
+    start = float(three.energy(ZERO, *y0))
+    error = lambda q, p: abs(float(three.energy(ZERO, q, p)) / start - 1)
+    for t1 in (10.0, 60.0):
+        row(f"three bodies, t = {t1:g}", three, density, t1, y0, error)
 
 
 def chaos(quick):
@@ -418,7 +479,7 @@ def main():
     parser.add_argument("--pictures", type=pathlib.Path, help="folder for figures")
     options = parser.parse_args()
     groups = (
-        *(overflow, stability, long_times, kepler, encounters, chaos),
+        *(overflow, stability, long_times, kepler, encounters, infalls, chaos),
         *(singular_damping, non_smooth, broken),
     )
     out = {}

@@ -44,3 +44,10 @@ STEP_DENSITY_MISSED = _entry(
     "than a factor of four: the density changes too much over a step. Reduce `epsilon` "
     "of `StepDensityController`.",
 )
+STEP_DENSITY_INVALID = _entry(
+    "step_density_invalid",
+    "The `density` of `StepDensityController` is not positive and finite at a state of "
+    "the solve. Write one that is, such as `jnp.linalg.norm(y[0]) ** 1.5` for a "
+    "distance that does not vanish. If the state itself is not finite, reduce "
+    "`epsilon`.",
+)

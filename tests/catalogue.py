@@ -1040,7 +1040,7 @@ def _step_density(problem, n, y0):
     density = lambda t, y, args: (
         1 / (1 + 0.2 * sum(jnp.sum(x**2) for x in jax.tree.leaves(y[0])))
     )
-    controller = dps.StepDensityController(problem.system, problem.length(n), density)
+    controller = dps.StepDensityController(problem.length(n), density)
     ts = dfx.SaveAt(t1=True)
     sol = problem.solve(None, y0, ts, stepsize_controller=controller)
     return [(sol.ts, sol.ys)], sol.result
