@@ -27,7 +27,8 @@ def merged(rows: dict) -> dict:
 
 
 def table() -> str:
-    schemes, laws = catalogue.SCHEMES, catalogue.FRICTION
+    both = catalogue.SCHEMES, catalogue.FRICTION
+    schemes, laws = ([x for x in xs if "own" not in x.name] for xs in both)
     columns = merged({s.name: [cell(s, law) for law in laws] for s in schemes})
     cells = zip(*columns.values(), strict=True)
     rows = merged({law.name: row for law, row in zip(laws, cells, strict=True)})

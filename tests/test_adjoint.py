@@ -566,3 +566,70 @@ def test_the_last_saved_time_where_steps_are_short():
 
     gradient = jax.vmap(jax.grad(saved))(jnp.array([0.5, 1.0]))
     assert jnp.all(jnp.isfinite(gradient))
+
+
+# States of the last three rates cannot be recomputed between 8 of 1000 kept ones.
+RATES = jnp.concatenate([jnp.linspace(0.0, 5.0, 61), jnp.array([1e3, 3e3, 1e4])])
+
+
+def _damped(gamma, adjoint, throw=True):
+    system = dps.MechanicalSystem(
+        dps.QuadraticKinetic(),
+        lambda t, q, args: 1 - jnp.cos(q),
+        dps.ConstantDamping(gamma),
+    )
+    sol = dfx.diffeqsolve(
+        *(system, dps.TunedRKN6(), 0.0, 2.0, 2e-3),
+        (jnp.asarray(1.5), jnp.asarray(0.3)),
+        saveat=dfx.SaveAt(ts=jnp.linspace(0.0, 2.0, 7)),
+        adjoint=adjoint,
+        max_steps=1000,
+        throw=throw,
+    )
+    assert sol.ys is not None
+    return jnp.sum(sol.ys[0] ** 2)
+
+
+FEW = dps.FixedStepAdjoint(checkpoints=8)
+
+
+def test_a_gradient_that_is_lost_is_that_of_one_member_of_a_batch():
+    slopes = jax.jit(jax.vmap(jax.grad(lambda gamma: _damped(gamma, FEW))))(RATES)
+    assert jnp.all(jnp.isnan(slopes[-3:]))
+    alone = jax.jit(jax.grad(lambda gamma: _damped(gamma, FEW)))
+    exact = jax.vmap(jax.grad(lambda gamma: _damped(gamma, FIXED_STEP)))(RATES)
+    some = np.arange(0, 61, 12)
+    np.testing.assert_allclose(slopes[some], [alone(x) for x in RATES[some]], rtol=1e-9)
+    np.testing.assert_allclose(slopes[:-3], exact[:-3], rtol=1e-8)
+    # Nothing is inverted between as many kept states as steps.
+    every = dps.FixedStepAdjoint(checkpoints=999)
+    kept = jax.grad(lambda gamma: _damped(gamma, every))(RATES[-1])
+    np.testing.assert_allclose(kept, exact[-1], rtol=1e-12)
+
+
+def test_a_gradient_that_is_lost_is_an_error_or_not_a_number():
+    slope = lambda adjoint, **options: jax.grad(
+        lambda gamma: _damped(gamma, adjoint, **options)
+    )
+    with pytest.raises(Exception, match="with an error beyond"):
+        jax.block_until_ready(slope(FEW)(RATES[-1]))
+    assert jnp.isnan(slope(FEW, throw=False)(RATES[-1]))
+    never = dps.FixedStepAdjoint(checkpoints=8, throw=False)
+    assert jnp.isnan(slope(never)(RATES[-1]))
+    always = dps.FixedStepAdjoint(checkpoints=8, throw=True)
+    with pytest.raises(Exception, match="with an error beyond"):
+        jax.block_until_ready(jax.vmap(slope(always, throw=False))(RATES[-2:]))
+
+
+def test_the_branch_of_a_batch_that_is_not_taken():
+    """JAX differentiates it at zeros, of which no state can be recomputed."""
+
+    def value(deep, k, adjoint):
+        branch = lambda factor: lambda k: _held(factor * k, HOLDERS["closure"], adjoint)
+        return jax.lax.cond(deep, branch(1.0), branch(2.0), k)
+
+    slopes = jax.vmap(jax.grad(value, argnums=1), (0, None, None))
+    both = slopes(jnp.array([True, False]), 1.3, REVERSIBLE)
+    for deep, slope in zip((True, False), both, strict=True):
+        exact = jax.grad(value, argnums=1)(deep, 1.3, CHECKPOINTED)
+        np.testing.assert_allclose(slope, exact, rtol=1e-12)

@@ -25,7 +25,10 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     recommended way to solve, with or without gradients.
 
     Between steps the solution is a shorter step of the scheme, of its full order. A
-    solve whose final or saved states are not finite fails.
+    solve whose final or saved states are not finite fails; of an explicit scheme it
+    ends at the next saved time, as the steps between are not checked. For a time of
+    `SaveAt(ts=...)` that is NaN, a gap in measured times, nothing is saved: the row
+    stays infinite, as do rows after the end of a solve.
 
     For every solver of this package, with `diffrax.ConstantStepSize`,
     [`diffrax_presym.StepsBetween`][] or `diffrax.StepTo`, and any `SaveAt` but dense
@@ -35,18 +38,20 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     and adaptive steps are errors; use `diffrax.RecursiveCheckpointAdjoint` for these.
 
     The gradient is that of the discrete solution ("discretise, then optimise"), with
-    respect to `y0`, `args`, the system, and everything that a function of these or of
-    `SaveAt(fn=...)` closes over; derivatives with respect to times are errors. By
-    default the scheme is run backwards: memory does not depend on the number of steps,
-    and a gradient costs two to five solves. Damping loses information: backwards in
-    time rounding errors grow by $e^{\eta(t_1) - \eta(t_0)}$. So states are kept along
-    the way, more with more damping, from which the backward pass restarts. The error of
-    the recomputed states is measured at each kept state, and one beyond `tol` raises an
-    error. By `gradient="checkpoints"`, and for schemes without an inverse, the steps
-    between kept states are computed again instead; the memory then grows with the
-    square root of the number of steps. For second derivatives use forward mode over
-    reverse mode, `jax.jvp` of `jax.grad`; for forward mode alone
-    `diffrax.ForwardMode()`.
+    respect to `y0`, `args`, the system, the solver, and everything that a function of
+    these or of `SaveAt(fn=...)` closes over; derivatives with respect to times are
+    errors. By default the scheme is run backwards: memory does not depend on the number
+    of steps, and a gradient costs two to five solves. Damping loses information:
+    backwards in time rounding errors grow by $e^{\eta(t_1) - \eta(t_0)}$. So states are
+    kept along the way, more with more damping, from which the backward pass restarts: a
+    kept state is the start of its step, and with as many as steps none is recomputed.
+    The error of the recomputed states is measured. Where it is beyond `tol` the
+    gradient is NaN, of that member of a batch alone; outside of a batch that is an
+    error, unless the solve has `throw=False`. By `gradient="checkpoints"`, and for
+    schemes without an inverse, the steps between kept states are computed again
+    instead; the memory then grows with the square root of the number of steps. For
+    second derivatives use forward mode over reverse mode, `jax.jvp` of `jax.grad`; for
+    forward mode alone `diffrax.ForwardMode()`.
     """
 
     gradient: Literal["reversal", "checkpoints"] | None = None
@@ -135,18 +140,21 @@ FixedStepAdjoint.__init__.__doc__ = r"""**Arguments:**
 - `gradient`: `"reversal"`, by running the scheme backwards, or `"checkpoints"`, by
     computing steps again. Defaults to `None`: by reversal if the scheme has an inverse.
 - `checkpoints`: the maximum number of states to keep besides the two ends, which
-    determines the memory. Defaults to `None`: for reversal 128, enough for an increment
-    of $\eta$ of 1000 in `float64`, and of a few hundred in `float32`; for checkpoints
-    the square root of `max_steps`, with which the memory is least.
+    determines the memory. Defaults to `None`: for reversal 128; for checkpoints the
+    square root of `max_steps`, with which the memory is least.
 - `tol`: the largest error of a state recomputed by reversal, relative to the size of
     the state. Defaults to the precision of the state to the power 2/3: 4e-11 in
     `float64`, 2e-5 in `float32`.
+- `throw`: whether a gradient by reversal that is lost to rounding is an error (`True`),
+    also of one member of a batch, or NaN (`False`). Defaults to `None`: an error unless
+    it is of a batch or the solve has `throw=False`.
 
 **Raises:**
 
 `ValueError` if any is out of range, and when the solve is traced if it is not
-supported. `RuntimeError` when the gradient is computed, if the error at a kept state
-exceeds `tol`.
+supported. `RuntimeError` when the gradient is computed, if the error of a recomputed
+state exceeds `tol` and that is not NaN instead; and of a solve by `diffrax.StepTo`
+whose times do not start at `t0` and end at `t1`.
 """
 
 
@@ -185,16 +193,7 @@ def _check_history(solver, scheme: Scheme, controller) -> None:
 def _final_state(problem: Problem, way: Reversal | Checkpoints, init_state, structure):
     """Diffrax's state at the end of the solve."""
     buffers = private.saved_buffers(init_state, structure)
-    try:
-        out = _solve((problem, buffers), way)
-    except TypeError as error:
-        if "forward-mode" not in str(error):
-            raise
-        raise ValueError(
-            "`FixedStepAdjoint` has no forward mode (`jax.jvp`, `jax.jacfwd`). Write "
-            "`adjoint=diffrax.ForwardMode()` for that; or for second derivatives "
-            "`jax.jvp` of `jax.grad`."
-        ) from error
+    out = _solve((problem, buffers), way)
     out, counts = eqx.partition(out, eqx.is_inexact_array)
     # To JAX all outputs of a custom rule have derivatives, even integers.
     end, saved, n, result, meter = eqx.combine(

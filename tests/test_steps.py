@@ -1,0 +1,118 @@
+"""Times at the edge: steps that are infinite or end elsewhere, gaps in saved times."""
+
+from typing import Any
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import diffrax_presym as dps
+
+
+OWN = dps.FixedStepAdjoint()
+PENDULUM = dps.MechanicalSystem(
+    dps.QuadraticKinetic(),
+    lambda t, q, args: -jnp.sum(jnp.cos(q)),
+    dps.ConstantDamping(0.1),
+)
+
+
+def solve(dt0=0.1, *, size=1, solver=None, **options) -> Any:
+    y0 = jnp.full(size, 1.0), jnp.full(size, 0.3)
+    options = {"max_steps": 100, "throw": False, "adjoint": OWN} | options
+    solver = dps.TunedRKN6() if solver is None else solver
+    return dfx.diffeqsolve(PENDULUM, solver, 0.0, 1.0, dt0, y0, **options)
+
+
+def exact(t):
+    field = lambda t, y: [y[1], -np.sin(y[0]) - 0.1 * y[1]]
+    sol = solve_ivp(field, (0, 1), [1.0, 0.3], rtol=1e-12, atol=1e-12, t_eval=t)
+    return sol.y
+
+
+@pytest.mark.parametrize("adjoint", [OWN, dfx.RecursiveCheckpointAdjoint()])
+@pytest.mark.parametrize(
+    "controller, steps",
+    [(dfx.ConstantStepSize(), 1), (dps.StepsBetween(jnp.linspace(0.0, 1.0, 5)), 4)],
+)
+def test_an_infinite_step_is_as_long_as_it_can_be(adjoint, controller, steps):
+    sol = solve(jnp.inf, stepsize_controller=controller, adjoint=adjoint)
+    assert sol.result == dfx.RESULTS.successful and sol.stats["num_steps"] == steps
+    np.testing.assert_allclose(np.ravel(sol.ys), exact([1.0])[:, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("dt0", [jnp.nan, -jnp.inf])
+def test_a_step_that_is_no_step(dt0):
+    try:
+        assert solve(jnp.asarray(dt0)).result != dfx.RESULTS.successful
+    except RuntimeError as error:
+        assert "dt0" in str(error)
+
+
+@pytest.mark.parametrize("ts", [[0.0, 0.25, 0.5], [0.5, 0.75, 1.0], [-0.5, 0.5, 1.0]])
+def test_prescribed_steps_are_from_the_start_to_the_end(ts):
+    with pytest.raises(Exception, match="must be `t0` and `t1`"):
+        sol = solve(None, stepsize_controller=dfx.StepTo(ts=jnp.array(ts)))
+        jax.block_until_ready(sol.ys)
+
+
+TIMES = np.array([0.1, np.nan, 0.33, np.nan, np.nan, 0.5, 1.0])
+GAPS = np.isnan(TIMES)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"size": 300},  # outputs one by one
+        {"solver": dps.PresymplecticGauss(2)},
+        {"adjoint": dps.FixedStepAdjoint("checkpoints")},
+    ],
+    ids=str,
+)
+def test_gaps_in_the_saved_times(options):
+    def saved(k, ts):
+        system = dps.MechanicalSystem(
+            dps.QuadraticKinetic(k), PENDULUM.potential, PENDULUM.friction
+        )
+        size, solver = options.get("size", 1), options.get("solver", dps.TunedRKN6())
+        return dfx.diffeqsolve(
+            *(system, solver, 0.0, 1.0, 0.05, (jnp.ones(size), jnp.full(size, 0.3))),
+            saveat=dfx.SaveAt(ts=ts, t1=True),
+            adjoint=options.get("adjoint", OWN),
+            max_steps=64,
+        )
+
+    sol: Any = jax.jit(saved)(1.0, jnp.asarray(TIMES))
+    q, p = (np.asarray(x[:-1, 0]) for x in sol.ys)
+    assert np.all(np.isinf(q[GAPS]) & np.isinf(p[GAPS]) & np.isinf(sol.ts[:-1][GAPS]))
+    at = exact(TIMES[~GAPS])
+    np.testing.assert_allclose([q[~GAPS], p[~GAPS]], at, atol=2e-6)
+
+    def loss(k, ts):
+        ys: Any = saved(k, ts).ys
+        return sum(jnp.sum(jnp.where(jnp.isfinite(y), y, 0) ** 2) for y in ys)
+
+    slopes = jax.jit(jax.grad(loss))
+    alone = slopes(1.0, jnp.asarray(TIMES[~GAPS]))
+    np.testing.assert_allclose(slopes(1.0, jnp.asarray(TIMES)), alone, rtol=1e-10)
+    assert np.isfinite(alone)
+
+
+def test_a_solve_ends_at_the_next_saved_time_after_it_has_failed():
+    """Of an explicit scheme, whose steps between are not checked."""
+    system = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), lambda t, q, args: jnp.sum(q**4) / 4
+    )
+    y0 = jnp.array([1.0]), jnp.zeros(1)
+    sol: Any = dfx.diffeqsolve(
+        *(system, dps.TunedRKN6(), 0.0, 1000.0, 10.0, y0),
+        saveat=dfx.SaveAt(ts=jnp.arange(0.0, 1001.0, 50.0)),
+        **{"throw": False, "adjoint": OWN},
+    )
+    assert sol.result == dfx.RESULTS.nonfinite  # pyright: ignore
+    assert sol.stats["num_steps"] <= 10
+    assert np.all(np.isinf(sol.ts[3:])) and np.all(np.isinf(sol.ys[0][3:]))
