@@ -27,18 +27,19 @@ def as_parameter(x, name: str, instead: str = "") -> Inexact[Array, "..."]:
 
 def as_finite(x, name: str, instead: str = "") -> Inexact[Array, "..."]:
     """As `as_parameter`, and checked to be finite unless it is traced."""
-    x = as_parameter(x, name, instead)
+    parameter = as_parameter(x, name, instead)
+    # Under `jax.jit` a parameter is traced, but not what it was made of.
     if not isinstance(x, Tracer) and not np.all(np.isfinite(np.asarray(x))):
         raise ValueError(f"{name} must be finite, but got {x}.")
-    return x
+    return parameter
 
 
 def as_positive(x, name: str, instead: str = "") -> Inexact[Array, "..."]:
     """As `as_parameter`, and checked to be positive unless it is traced."""
-    x = as_parameter(x, name)
+    parameter = as_parameter(x, name)
     if not isinstance(x, Tracer) and not np.all(np.asarray(x) > 0):
         raise ValueError(f"{name} must be positive, but got {x}.{instead}")
-    return x
+    return parameter
 
 
 def check_callable(

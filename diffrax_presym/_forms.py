@@ -39,15 +39,17 @@ def as_mass(form, name: str, instead: str):
         return form
 
     def leaf(x):
-        entries, which = as_parameter(x, name, instead), name
+        mass = as_parameter(x, name, instead)
+        if isinstance(x, Tracer):
+            return mass
+        entries, which = np.asarray(x), name
         if _may_be_matrix(entries):
             # Its other entries may have any sign.
             as_finite(entries, name)
-            entries = jnp.diagonal(entries, axis1=-2, axis2=-1)
+            entries = np.diagonal(entries, axis1=-2, axis2=-1)
             which = f"The diagonal of {name}"
-        negative = not isinstance(entries, Tracer) and np.any(np.asarray(entries) < 0)
-        as_positive(entries, which, _NEGATIVE if negative else _MASSLESS)
-        return as_parameter(x, name)
+        as_positive(entries, which, _NEGATIVE if np.any(entries < 0) else _MASSLESS)
+        return mass
 
     return jtu.tree_map(leaf, form)
 
@@ -70,6 +72,7 @@ def is_symmetric(form) -> bool:
         if isinstance(x, Tracer) or not _may_be_matrix(x):
             return True
         x = np.asarray(x)
+        x = x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
         rounding = float(jnp.finfo(x.dtype).eps) ** 0.5 * np.max(np.abs(x), initial=0)
         return bool(np.all(np.abs(x - np.swapaxes(x, -1, -2)) <= rounding))
 

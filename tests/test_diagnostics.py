@@ -33,8 +33,9 @@ DRIVEN = dps.MechanicalSystem(dps.QuadraticKinetic(), driven, dps.LogDamping(2.0
 
 
 def test_energies():
-    ts, ys = jnp.array([0.0, 3.0]), tuple(jnp.array([[[1.0], [2.0]], [[0.0], [1.0]]]))
-    assert_close(diagnostics.energy(TERM, ts, ys), jnp.array([0.5, 2.5]), 1e-15)
+    ts, (q, p) = jnp.array([0.0, 3.0]), jnp.array([[[1.0], [2.0]], [[0.0], [1.0]]])
+    energies = diagnostics.energy(TERM, ts, (q, p))
+    assert_close(energies, jnp.array([0.5, 2.5]), 1e-15)
 
 
 @pytest.mark.variants(1)

@@ -4,7 +4,7 @@ Each message says what was given, what is expected, and what to write instead.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -589,7 +589,8 @@ HAMILTONIANS = {
 }
 
 
-OF_PLACE = lambda q: q
+OF_PLACE: Any = lambda q: q
+WEAK: Any = "weak"
 PLACE, PLACE_GIVEN = "`PositionDamping(rate)`", "one of the arguments (q)"
 ETA = "`friction` must be a function `eta(t)`"
 WRONG_FUNCTIONS = {
@@ -629,7 +630,7 @@ WRONG_FUNCTIONS = {
             lambda fn=fn: dps.PositionDamping(fn),
             Mistake(given, "a function `rate(t, q, args)`", "`ConstantDamping(rate)`"),
         )
-        for given, fn in ((PLACE_GIVEN, OF_PLACE), ("got 0.3", 0.3))
+        for given, fn in ((PLACE_GIVEN, OF_PLACE), ("got 'weak'", WEAK))
     },
     **{
         f"{name} of q": (
@@ -679,6 +680,24 @@ def test_hamiltonians(act, mistake):
     with pytest.raises(ValueError) as error:
         act()
     mistake.check(error)
+
+
+@pytest.mark.parametrize(
+    "make, mistake",
+    [
+        (lambda: dps.QuadraticKinetic(-1.0), POSITIVE),
+        (lambda: dps.QuadraticKinetic(np.array([[1, 2], [2, -1]])), POSITIVE),
+        (lambda: dps.RelativisticKinetic(0.0), POSITIVE),
+        (lambda: dps.ConstantDamping(np.nan), "must be finite"),
+        (
+            lambda: dps.QuadraticPotential(np.array([[2, 1], [0, 2]]))(0.0, VECTOR),
+            IS_SYMMETRIC,
+        ),
+    ],
+)
+def test_numbers_known_in_a_traced_function_are_checked(make, mistake):
+    with pytest.raises(ValueError, match=mistake):
+        jax.eval_shape(lambda t: (make(), t)[1], 0.0)
 
 
 def test_masses_not_yet_known_are_not_judged():

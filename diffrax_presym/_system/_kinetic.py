@@ -119,7 +119,7 @@ class QuadraticKinetic(AbstractKinetic):
         operators other than `lineax.MatrixLinearOperator`.
         """
         self.mass = as_mass(mass, MASS, _OF_POSITIONS)
-        self.symmetric = is_symmetric(self.mass)
+        self.symmetric = is_symmetric(mass)
 
     is_quadratic: ClassVar[bool] = True
     is_autonomous: ClassVar[bool] = True

@@ -67,7 +67,7 @@ class QuadraticPotential(AbstractPotential):
         operators other than `lineax.MatrixLinearOperator`.
         """
         self.stiffness = as_form(stiffness, _STIFFNESS, _NO_FUNCTION)
-        self.symmetric = is_symmetric(self.stiffness)
+        self.symmetric = is_symmetric(stiffness)
 
     def __call__(self, t: Time, q: PyTree, args: PyTree = None) -> Scalar:
         return -tree.dot(q, self.force(t, q)) / 2
