@@ -13,11 +13,11 @@ from jaxtyping import Array, Inexact, PyTree
 from ._numbers import cast_to
 
 
-def as_parameter(x, name: str) -> Inexact[Array, "..."]:
+def as_parameter(x, name: str, instead: str = "") -> Inexact[Array, "..."]:
     """A user's number as a leaf for `jax.grad` and `eqx.filter_grad`."""
     if not eqx.is_array_like(x):
-        array = " Write `jnp.array(...)`." if isinstance(x, list | tuple) else ""
-        raise ValueError(f"{name} must be a real number, but got {x!r}.{array}")
+        instead = " Write `jnp.array(...)`." if isinstance(x, list | tuple) else instead
+        raise ValueError(f"{name} must be a real number, but got {x!r}.{instead}")
     if jnp.issubdtype(jnp.result_type(x), jnp.complexfloating):
         raise ValueError(f"{name} must be real, but got {x!r}.")
     if not jnp.issubdtype(jnp.result_type(x), jnp.floating):
@@ -25,28 +25,35 @@ def as_parameter(x, name: str) -> Inexact[Array, "..."]:
     return jnp.asarray(x)
 
 
-def as_finite(x, name: str) -> Inexact[Array, "..."]:
+def as_finite(x, name: str, instead: str = "") -> Inexact[Array, "..."]:
     """As `as_parameter`, and checked to be finite unless it is traced."""
-    x = as_parameter(x, name)
+    parameter = as_parameter(x, name, instead)
+    # Under `jax.jit` a parameter is traced, but not what it was made of.
     if not isinstance(x, Tracer) and not np.all(np.isfinite(np.asarray(x))):
         raise ValueError(f"{name} must be finite, but got {x}.")
-    return x
+    return parameter
 
 
 def as_positive(x, name: str, instead: str = "") -> Inexact[Array, "..."]:
     """As `as_parameter`, and checked to be positive unless it is traced."""
-    x = as_parameter(x, name)
+    parameter = as_parameter(x, name)
     if not isinstance(x, Tracer) and not np.all(np.asarray(x) > 0):
         raise ValueError(f"{name} must be positive, but got {x}.{instead}")
-    return x
+    return parameter
 
 
-def check_callable(fn, name: str, signature: str, optional: bool = False) -> None:
+def check_callable(
+    fn, name: str, signature: str, optional: bool = False, instead: str = ""
+) -> None:
     """An error unless `fn` is a function that takes the arguments of `signature`."""
     if optional and fn is None:
         return
+    wanted = f"`{name}` must be a function `{signature}`, but got"
     if not callable(fn):
-        raise ValueError(f"`{name}` must be a function `{signature}`, but got {fn!r}.")
+        raise ValueError(f"{wanted} {fn!r}.{instead}")
+    if isinstance(fn, type):
+        name = fn.__name__
+        raise ValueError(f"{wanted} the class `{name}`. Write `{name}(...)`.")
     try:
         parameters = inspect.signature(fn)
     except (TypeError, ValueError):  # of a builtin, say
@@ -55,8 +62,7 @@ def check_callable(fn, name: str, signature: str, optional: bool = False) -> Non
         parameters.bind(*signature.split(","))
     except TypeError:
         raise ValueError(
-            f"`{name}` must be a function `{signature}`, but got one of the arguments "
-            f"{parameters}."
+            f"{wanted} one of the arguments {parameters}.{instead}"
         ) from None
 
 

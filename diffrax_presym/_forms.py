@@ -4,40 +4,98 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, PyTree
 
-from ._checks import as_finite, as_positive
+from ._checks import as_finite, as_parameter, as_positive
 from ._numbers import cast_to
 
 
+_NEGATIVE = (
+    " For a negative effective mass write the kinetic energy as a function "
+    "`T(t, p, args)`; or reverse the signs of the mass, of the potential and of all "
+    "friction per velocity, for the same positions and the opposite momenta."
+)
 _MASSLESS = (
     " For massless test particles let `p` be the momentum per unit mass: "
     "`MechanicalSystem(QuadraticKinetic(), ForceField(acceleration))`."
 )
 
 
-def as_form(form, name: str, positive: bool):
-    """A number, an array, a matrix, a pytree of these, a Lineax operator or `None`."""
-    if form is None or isinstance(form, lx.AbstractLinearOperator):
+def as_form(form, name: str, instead: str = ""):
+    """A number, an array, a matrix, a pytree of these, a Lineax operator or `None`.
+
+    `instead` is what to write in place of a function.
+    """
+    if form is None or is_operator(form):
+        return form
+    return jtu.tree_map(lambda x: as_finite(x, name, instead), form)
+
+
+def as_mass(form, name: str, instead: str):
+    """The same, of positive numbers."""
+    if form is None or is_operator(form):
         return form
 
     def leaf(x):
-        shape = jnp.shape(x)
-        if not positive:
-            return as_finite(x, name)
-        if len(shape) != 2 or shape[0] != shape[1]:
-            return as_positive(x, name, _MASSLESS)
-        # It may be a matrix, whose other entries may have any sign.
-        as_positive(jnp.diagonal(x), f"The diagonal of {name}", _MASSLESS)
-        return as_finite(x, name)
+        mass = as_parameter(x, name, instead)
+        if isinstance(x, Tracer):
+            return mass
+        entries, which = np.asarray(x), name
+        if _may_be_matrix(entries):
+            # Its other entries may have any sign.
+            as_finite(entries, name)
+            entries = np.diagonal(entries, axis1=-2, axis2=-1)
+            which = f"The diagonal of {name}"
+        as_positive(entries, which, _NEGATIVE if np.any(entries < 0) else _MASSLESS)
+        return mass
 
     return jtu.tree_map(leaf, form)
 
 
-def fit_form(form, x: PyTree, name: str, state: str) -> PyTree:
+def _may_be_matrix(x) -> bool:
+    return jnp.ndim(x) > 1 and jnp.shape(x)[-1] == jnp.shape(x)[-2]
+
+
+def is_symmetric(form) -> bool:
+    """False if a form is known not to be symmetric, should it be a matrix.
+
+    Whether it is one depends on the state.
+    """
+    if isinstance(form, lx.MatrixLinearOperator):
+        form = form.matrix
+    elif is_operator(form):  # The entries of others may take long to compute.
+        return True
+
+    def leaf(x):
+        if isinstance(x, Tracer) or not _may_be_matrix(x):
+            return True
+        x = np.asarray(x)
+        x = x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
+        rounding = float(jnp.finfo(x.dtype).eps) ** 0.5 * np.max(np.abs(x), initial=0)
+        return bool(np.all(np.abs(x - np.swapaxes(x, -1, -2)) <= rounding))
+
+    return all(map(leaf, jtu.tree_leaves(form)))
+
+
+def _check_symmetric(symmetric: bool, name: str) -> None:
+    if not symmetric:
+        raise ValueError(
+            f"{name} must be a symmetric matrix, but got one that is not. Write "
+            "`(A + A.T) / 2` if its symmetric part is meant, and `ForceField(force)` "
+            "for a force that has no energy."
+        )
+
+
+def fit_form(form, x: PyTree, name: str, state: str, symmetric: bool = True) -> PyTree:
     """The arrays of a form for the leaves of `x`: for each an array with as many axes
     that broadcasts to it or, with one more, a matrix for each vector over the last
-    axis."""
+    axis.
+
+    `ValueError` if it does not fit, or is a matrix that is not `symmetric` and should
+    be.
+    """
     if form is None:
         return jtu.tree_map(lambda xi: jnp.ones((), jnp.result_type(xi)), x)
 
@@ -52,6 +110,7 @@ def fit_form(form, x: PyTree, name: str, state: str) -> PyTree:
                     f"`{state}`, but got shape {form.shape} for `{state}` of shape "
                     f"{shape}."
                 )
+            _check_symmetric(symmetric, name)
         fits = form.ndim == 0 or (
             form.ndim == len(wanted)
             and all(m in (1, n) for m, n in zip(form.shape, wanted, strict=True))
@@ -93,20 +152,24 @@ def matvec(matrix: Array, x: Array) -> Array:
     return jnp.sum(matrix * x[..., None, :], axis=-1)
 
 
-def multiply(form, x: PyTree, name: str, state: str) -> PyTree:
-    if form is None or is_operator(form):
-        return x if form is None else form.mv(x)
+def multiply(form, x: PyTree, name: str, state: str, symmetric=True) -> PyTree:
+    if form is None:
+        return x
+    if is_operator(form):
+        _check_symmetric(symmetric, name)
+        return form.mv(x)
 
     def leaf(x, form):
         return matvec(form, x) if is_matrix(form, x) else form * x
 
-    return jtu.tree_map(leaf, x, fit_form(form, x, name, state))
+    return jtu.tree_map(leaf, x, fit_form(form, x, name, state, symmetric))
 
 
-def divide(form, x: PyTree, name: str, state: str) -> PyTree:
+def divide(form, x: PyTree, name: str, state: str, symmetric=True) -> PyTree:
     if form is None:
         return x
     if is_operator(form):
+        _check_symmetric(symmetric, name)
         return lx.linear_solve(form, x, throw=False).value
 
     def solve(form, x):
@@ -118,4 +181,4 @@ def divide(form, x: PyTree, name: str, state: str) -> PyTree:
             return x / form
         return jnp.vectorize(solve, signature="(n,n),(n)->(n)")(form, x)
 
-    return jtu.tree_map(leaf, x, fit_form(form, x, name, state))
+    return jtu.tree_map(leaf, x, fit_form(form, x, name, state, symmetric))

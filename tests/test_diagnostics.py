@@ -4,7 +4,14 @@ import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, harmonic, oscillator, pendulum, trajectory
+from helpers import (
+    assert_close,
+    harmonic,
+    mixed_energy,
+    oscillator,
+    pendulum,
+    trajectory,
+)
 
 import diffrax_presym as dps
 from diffrax_presym import diagnostics
@@ -12,6 +19,10 @@ from diffrax_presym import diagnostics
 
 Y0 = (jnp.array([1.0]), jnp.array([0.3]))
 TERM = oscillator(0.2)
+
+
+GAUSS = dps.PresymplecticGauss(1)
+TS, YS = jnp.array([0.0, 0.5]), (jnp.ones((2, 1)), jnp.ones((2, 1)))
 
 
 def driven(t, q, args):
@@ -22,8 +33,9 @@ DRIVEN = dps.MechanicalSystem(dps.QuadraticKinetic(), driven, dps.LogDamping(2.0
 
 
 def test_energies():
-    ts, ys = jnp.array([0.0, 3.0]), tuple(jnp.array([[[1.0], [2.0]], [[0.0], [1.0]]]))
-    assert_close(diagnostics.energy(TERM, ts, ys), jnp.array([0.5, 2.5]), 1e-15)
+    ts, (q, p) = jnp.array([0.0, 3.0]), jnp.array([[[1.0], [2.0]], [[0.0], [1.0]]])
+    energies = diagnostics.energy(TERM, ts, (q, p))
+    assert_close(energies, jnp.array([0.5, 2.5]), 1e-15)
 
 
 @pytest.mark.variants(1)
@@ -46,6 +58,34 @@ def test_energy_error_of_a_conserved_energy_is_its_change():
     ts, ys = jnp.array([0.0, 1.0]), (jnp.array([[1.0], [2.0]]), jnp.zeros((2, 1)))
     error = diagnostics.energy_error(term, ts, ys)
     assert_close(error, jnp.array([0.0, 1.5]), 1e-15)
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        lambda x, y: diagnostics.energy(x, TS, YS),
+        lambda x, y: diagnostics.energy_error(x, TS, YS),
+        lambda x, y: diagnostics.power_lost(x, TS, YS),
+        lambda x, y: diagnostics.energy_lost(x, TS, YS),
+        lambda x, y: diagnostics.structure_defect(x, GAUSS, 0.0, y, Y0),
+        lambda x, y: x.from_velocity(y, Y0),
+    ],
+    ids=["energy", "error", "power", "lost", "structure", "momentum"],
+)
+def test_a_system_is_compiled_once(act):
+    calls = []
+
+    def counted(t, q, p, args):
+        calls.append(t)
+        return mixed_energy(t, q, p, args)
+
+    system = dps.Hamiltonian(counted, dps.ConstantDamping(0.1))
+    first = act(system, 0.1)
+    number = len(calls)
+    assert number > 0
+    assert_close(act(system, 0.1), first, 0)
+    act(system, 0.2)
+    assert len(calls) == number
 
 
 def test_structure_defect():

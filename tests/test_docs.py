@@ -91,6 +91,33 @@ def test_docstring_runs(name, as_user):
     run(blocks, name, {**vars(dfx), **PUBLIC, **usual, "optx": optx})
 
 
+def example(value):
+    """The names that the examples of a docstring define."""
+    names = {**vars(dfx), **PUBLIC, "jnp": jnp, "dfx": dfx, "dps": dps}
+    run([x for doc in docstrings(value) for x in python_blocks(doc)], "", names)
+    return names
+
+
+def test_signs_of_the_examples():
+    # Forces of a magnetic field and of a rotating frame, on a velocity.
+    v, x = jnp.array([0.3, -0.7, 0.5]), example(dps.ViscousDamping)
+    force = lambda law: law.force(0.0, v, x["m"] * v, v, None)
+    magnetic = x["e"] * np.cross(v, x["B"])
+    np.testing.assert_allclose(force(x["magnetic"]), magnetic, rtol=1e-6)
+    coriolis = -2 * x["m"] * np.cross(x["Omega"], v)
+    np.testing.assert_allclose(force(x["coriolis"]), coriolis, rtol=1e-6)
+    # Gravity attracts.
+    system = example(dps.pairwise_potential)["system"]
+    q = jnp.array([[0.0, 0.0], [1.0, 0.0], [4.0, 0.0]])
+    assert system.force(0.0, q, 0 * q)[0, 0] > 0
+    # Links hang down, a shaft is bent back, and both lose energy.
+    for value, n in ((dps.LagrangianSystem, 2), (dps.MechanicalSystem, 3)):
+        system, q = example(value)["system"], jnp.full(n, 0.1)
+        assert np.all(system.force(0.0, q, 0 * q)[0] < 0)
+        p = jnp.arange(1.0, n + 1)
+        assert system.friction_force(0.0, q, p) @ system.velocity(0.0, q, p) < 0
+
+
 @pytest.mark.variants(1000)
 @pytest.mark.parametrize("page", PAGES, ids=lambda x: str(x.relative_to(ROOT)))
 def test_blocks_say_their_language(page):

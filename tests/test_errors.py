@@ -4,12 +4,13 @@ Each message says what was given, what is expected, and what to write instead.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 import optimistix as optx
 import pytest
@@ -388,6 +389,8 @@ LAW = "must be a law of friction, a function eta(t) or a list of these"
 RATE = "`ConstantDamping(rate)`"
 ONE_RATE = "Only one rate of damping for all momenta has a log scale"
 VECTOR, PLACES = jnp.array([0.1, 0.2]), jnp.ones((3, 2))
+ASYMMETRIC = jnp.array([[1.0, 0.5], [0.0, 1.0]])
+IS_SYMMETRIC, PART = "must be a symmetric matrix", "`(A + A.T) / 2`"
 
 HAMILTONIANS = {
     **{
@@ -397,6 +400,47 @@ HAMILTONIANS = {
         )
         for given in (0.0, -1.0, np.array([1.0, -2.0]))
     },
+    "negative effective mass": (
+        lambda: dps.QuadraticKinetic(-2.0),
+        Mistake("got -2.0", "negative effective mass", "a function `T(t, p, args)`"),
+    ),
+    "mass that is a function": (
+        lambda: dps.QuadraticKinetic(lambda q: q),
+        Mistake(f"{MASS} must be", "a real number", "`LagrangianSystem`"),
+    ),
+    "stiffness that is a function": (
+        lambda: dps.QuadraticPotential(harmonic),
+        Mistake(
+            "a real number", "function is passed", "`MechanicalSystem(kinetic, V)`"
+        ),
+    ),
+    **{
+        f"{name} that is not symmetric": (
+            lambda act=act: act(),
+            Mistake(f"`{name}`", IS_SYMMETRIC, PART),
+        )
+        for name, act in {
+            "QuadraticKinetic(mass)": lambda: system(dps.QuadraticKinetic(ASYMMETRIC)),
+            "QuadraticPotential(stiffness)": lambda: system(
+                potential=dps.QuadraticPotential(ASYMMETRIC)
+            ),
+        }.items()
+    },
+    **{
+        f"{name} that are not symmetric": (
+            lambda stiffness=stiffness, q=q: dps.QuadraticPotential(stiffness)(0.0, q),
+            Mistake("`QuadraticPotential(stiffness)`", IS_SYMMETRIC, PART),
+        )
+        for name, stiffness, q in (
+            ("matrices", jnp.stack([jnp.eye(2), ASYMMETRIC]), PLACES[:2]),
+            ("pytrees", {"a": ASYMMETRIC}, {"a": VECTOR}),
+            ("operators", lx.MatrixLinearOperator(ASYMMETRIC), VECTOR),
+        )
+    },
+    "velocity by a mass that is not symmetric": (
+        lambda: dps.EuclideanMirror(np.asarray(ASYMMETRIC)).gradient(VECTOR),
+        Mistake(MASS, IS_SYMMETRIC, PART),
+    ),
     "complex mass": (
         lambda: dps.QuadraticKinetic(1j),
         Mistake("got 1j", "must be real", MASS),
@@ -545,11 +589,115 @@ HAMILTONIANS = {
 }
 
 
+OF_PLACE: Any = lambda q: q
+WEAK: Any = "weak"
+PLACE, PLACE_GIVEN = "`PositionDamping(rate)`", "one of the arguments (q)"
+ETA = "`friction` must be a function `eta(t)`"
+WRONG_FUNCTIONS = {
+    "friction by place": (
+        lambda: dps.MechanicalSystem(KINETIC, harmonic, lambda t, q, args: 0.1 * q),
+        Mistake("the arguments (t, q, args)", ETA, PLACE),
+    ),
+    "a friction in a list": (
+        lambda: dps.LagrangianSystem(harmonic, harmonic, [DAMPING, lambda: 0.1]),
+        Mistake("the arguments ()", ETA, "`f(t, q, v, args)`"),
+    ),
+    "the class of a friction": (
+        lambda: dps.Hamiltonian(mixed_energy, dps.Drag),
+        Mistake("the class `Drag`", ETA, "Write `Drag(...)`"),
+    ),
+    "the class of a kinetic energy": (
+        lambda: dps.MechanicalSystem(dps.QuadraticKinetic, harmonic),
+        Mistake("the class", "`T(t, p, args)`", "Write `QuadraticKinetic(...)`"),
+    ),
+    **{
+        f"{law.__name__} without its number": (
+            lambda law=law: trace(
+                dps.MechanicalSystem(KINETIC, harmonic, law), LEAPFROG
+            ),
+            Mistake("got ", "`eta(t)` must be a real number", RATE),
+        )
+        for law in (dps.ConstantDamping, dps.LogDamping, dps.ViscousDamping)
+    },
+    "a complex log scale": (
+        lambda: trace(
+            dps.MechanicalSystem(KINETIC, harmonic, lambda t: 1j * t), LEAPFROG
+        ),
+        Mistake("complex", "`eta(t)` must be real", "The value of"),
+    ),
+    **{
+        f"PositionDamping of {given}": (
+            lambda fn=fn: dps.PositionDamping(fn),
+            Mistake(given, "a function `rate(t, q, args)`", "`ConstantDamping(rate)`"),
+        )
+        for given, fn in ((PLACE_GIVEN, OF_PLACE), ("got 'weak'", WEAK))
+    },
+    **{
+        f"{name} of q": (
+            lambda make=make: make(OF_PLACE),
+            Mistake(PLACE_GIVEN, f"`{name}` must be a function", signature),
+        )
+        for name, make, signature in (
+            ("ViscousDamping(coefficients)", dps.ViscousDamping, "`C(t, q, args)`"),
+            ("Drag(coefficient)", dps.Drag, "`c(t, q, args)`"),
+            ("Drag(..., medium=...)", lambda w: dps.Drag(1.0, w), "`w(t, q, args)`"),
+            ("force", dps.ForceField, "`force(t, q, args)`"),
+            ("pairwise_potential(fn)", dps.pairwise_potential, "`fn(t, r, args)`"),
+        )
+    },
+    **{
+        f"{name} of a function": (
+            lambda make=make: make(OF_PLACE),
+            Mistake("got <function", f"`{name}", f"function `eta(t)`, one that depends "
+            f"on place by {PLACE}"),
+        )
+        for name, make in (
+            ("ConstantDamping", dps.ConstantDamping),
+            ("LogDamping", dps.LogDamping),
+            ("PowerDamping", lambda gamma: dps.PowerDamping(gamma, 2.0)),
+        )
+    },
+    "a scaling of two arguments": (
+        lambda: dps.Scaling(dps.LogDamping(2.0), lambda t, c: c * t),
+        Mistake("the arguments (t, c)", "`beta` must be a function", "`eta(t)`"),
+    ),
+    "a log scale of the paper's family": (
+        lambda: dps.DissipativeHamiltonian(KINETIC, harmonic, lambda t, q: t, DAMPING),
+        Mistake("the arguments (t, q)", "`eta1` must be a function", "`eta(t)`"),
+    ),
+}  # fmt: skip
+
+
+@mistakes(WRONG_FUNCTIONS)
+def test_functions_of_other_arguments(act, mistake):
+    with pytest.raises(ValueError) as error:
+        act()
+    mistake.check(error)
+
+
 @mistakes(HAMILTONIANS)
 def test_hamiltonians(act, mistake):
     with pytest.raises(ValueError) as error:
         act()
     mistake.check(error)
+
+
+@pytest.mark.parametrize(
+    "make, mistake",
+    [
+        (lambda: dps.QuadraticKinetic(-1.0), POSITIVE),
+        (lambda: dps.QuadraticKinetic(np.array([[1, 2], [2, -1]])), POSITIVE),
+        (lambda: dps.RelativisticKinetic(0.0), POSITIVE),
+        (lambda: dps.ConstantDamping(np.nan), "must be finite"),
+        (
+            lambda: dps.QuadraticPotential(np.array([[2, 1], [0, 2]]))(0.0, VECTOR),
+            IS_SYMMETRIC,
+        ),
+    ],
+)
+def test_numbers_known_in_a_traced_function_are_checked(make, mistake):
+    with pytest.raises(ValueError, match=mistake):
+        jax.eval_shape(lambda t: (make(), t)[1], 0.0)
 
 
 def test_masses_not_yet_known_are_not_judged():

@@ -1,6 +1,7 @@
 """Hamiltonians agree with their formulas: derivatives, momenta, vector fields."""
 
 from decimal import Decimal, localcontext
+from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
@@ -10,6 +11,7 @@ import jax.tree_util as jtu
 import lineax as lx
 import numpy as np
 import pytest
+import scipy.integrate
 from helpers import assert_close, drift, flat, henon_heiles, mixed_energy, solve
 
 import diffrax_presym as dps
@@ -203,6 +205,7 @@ def test_states_by_velocities(name):
 
 P2 = jnp.array([[0.3, -0.2, 1.0], [0.5, 0.1, -0.4]])
 TREE = {"a": P, "b": (jnp.array(0.5), P2)}
+MATRIX = jnp.array([[2.0, -0.5, 0.0], [-0.5, 1.0, 0.1], [0.0, 0.1, 3.0]])
 MASSES = {
     "none": (None, P, P),
     "none, array of rank two": (None, P2, P2),
@@ -220,6 +223,21 @@ MASSES = {
         P2 / np.array([[2.0, 3.0, 4.0], [2.0, 3.0, 4.0]]),
     ),
     "matrix": (MASS, P, np.linalg.solve(MASS, P)),
+    "symmetric to rounding": (
+        MASS.at[0, 1].multiply(1 + 1e-15),
+        P,
+        np.linalg.solve(MASS, P),
+    ),
+    "each vector a matrix": (
+        jnp.stack([MATRIX, 2 * MATRIX]),
+        P2,
+        np.linalg.solve(MATRIX, P2.T).T / np.array([[1.0], [2.0]]),
+    ),
+    "square, each entry": (
+        jnp.array([[2.0, 3.0], [5.0, 7.0]]),
+        P2[:, :2],
+        P2[:, :2] / np.array([[2.0, 3.0], [5.0, 7.0]]),
+    ),
     "operator": (
         lx.MatrixLinearOperator(MASS, lx.positive_semidefinite_tag),
         P,
@@ -244,6 +262,32 @@ def test_masses(mass, p, expected):
     assert_close(velocity, jtu.tree_map(jnp.asarray, expected), 1e-15)
     assert_close(kinetic(T, p), flat(p) @ flat(expected) / 2, 1e-15)
     assert_close(velocity, jax.grad(kinetic, 1)(T, p), 1e-14)
+
+
+@pytest.mark.parametrize("name", ["velocity", "function"])
+def test_negative_effective_masses_have_a_way(name):
+    # A synchrotron above transition: phi'' = -omega^2 sin(phi) about phi = 0, of
+    # T = -p^2 / 2 m and the potential of the opposite sign, with friction.
+    m, gamma = 2.0, 0.3
+    top = lambda t, q, args: jnp.sum(jnp.cos(q))
+    well = lambda t, q, args: -jnp.sum(jnp.cos(q))
+    if name == "function":
+        kinetic = lambda t, p, args: -jnp.sum(p**2) / (2 * m)
+        system, sign = (
+            dps.MechanicalSystem(kinetic, top, dps.ConstantDamping(gamma)),
+            -1,
+        )
+    else:
+        law = dps.ViscousDamping(gamma * m)  # of the mass -m it would be -gamma * m
+        system, sign = dps.MechanicalSystem(dps.QuadraticKinetic(m), well, law), 1
+    y0 = jnp.array([0.5]), jnp.array([sign * m * 0.2])
+    ys: Any = solve(system, dps.BlanesMoan6(), 0.0, 10.0, 0.05, y0).ys
+    rates = lambda t, y: [y[1], -np.sin(y[0]) / m - gamma * y[1]]
+    exact = scipy.integrate.solve_ivp(
+        rates, (0, 10), [0.5, 0.2], rtol=1e-12, atol=1e-12
+    ).y[:, -1]
+    end = jax.tree.map(lambda x: x[-1], ys)
+    assert_close(end, (exact[:1], sign * m * exact[1:]), 1e-8)
 
 
 ANY = dps.MechanicalSystem(kinetic, potential).kinetic
@@ -380,8 +424,19 @@ def test_pairwise_potential():
         dps.pairwise_potential(3.0)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="4 particles"):
         dps.pairwise_potential(fn, masses[:3])(*args)
-    with pytest.raises(ValueError, match="one array"):
-        potential(0.0, q[0], 1.0)
+    for wrong in (q[0], {"a": q}, [[0.0, 1.0]], 1.0):
+        with pytest.raises(ValueError, match="one array"):
+            potential(0.0, wrong, 1.0)
+
+
+def test_numpy_states():
+    gravity = dps.pairwise_potential(lambda t, r, args: -1 / r)
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), gravity, lambda t: 0.1 * t)
+    q, p = np.array([[0.0, 0.0], [2.0, 0.0]]), np.array([[0.0, 1.0], [0.0, 0.0]])
+    assert_close(system.energy(0.0, q, p), 0.0, 1e-15)
+    force = np.array([[0.25, 0.0], [-0.25, 0.0]])
+    assert_close(system.force(0.0, q, p), force, 1e-15)
+    assert_close(system.vf(0.0, (q, p), None), (p, force - 0.1 * p), 1e-15)
 
 
 @pytest.mark.parametrize("box", [2.0, np.array([2.0, 3.0])])

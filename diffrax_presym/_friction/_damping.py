@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
 from .. import _tree as tree
-from .._checks import as_finite
+from .._checks import as_finite, check_callable
 from .._forms import multiply
 from .._numbers import as_time, cast_to, Time
 from ._base import AbstractFriction, Linear as LinearPart, Mechanics, Parts
@@ -64,11 +64,19 @@ class Damping(AbstractFriction):
         return self._sum(lambda law: law.rate(as_time(t)))
 
 
+_VARYING = (
+    " A rate that depends on time is given by its integral, `friction=eta` with a "
+    "function `eta(t)`, one that depends on place by `PositionDamping(rate)`."
+)
+
+
 def as_numbers(x, name: str) -> Numbers:
     """A user's numbers for the entries of `p`: a number, an array or a pytree."""
-    if not jtu.tree_leaves(x):
-        return as_finite(x, name)
-    return jtu.tree_map(lambda x: as_finite(x, name), x)
+
+    def leaf(x):
+        return as_finite(x, name, _VARYING if callable(x) else "")
+
+    return jtu.tree_map(leaf, x) if jtu.tree_leaves(x) else leaf(x)
 
 
 def ConstantDamping(gamma) -> Damping:
@@ -140,11 +148,20 @@ def PowerDamping(gamma, delta) -> Damping:
     return Damping(((Power(delta), gamma),))
 
 
-def as_friction(law, name: str = "`friction`") -> AbstractFriction:
+_FRICTION = "`friction`"
+_OF_PLACE = (
+    " For a rate that depends on place write `PositionDamping(rate)`, for any other "
+    "force `force=f`, with a function `f(t, q, v, args)`."
+)
+
+
+def as_friction(law, name: str = _FRICTION) -> AbstractFriction:
     """A user's law of friction; a function `eta(t)` is one too."""
     if isinstance(law, AbstractFriction):
         return law
     if callable(law):
+        instead = _OF_PLACE if name == _FRICTION else ""
+        check_callable(law, name.strip("`"), "eta(t)", instead=instead)
         law = law if isinstance(law, AbstractLogScale) else FunctionOfTime(law)
         return Damping(((law, jnp.ones(())),))
     raise ValueError(
@@ -154,7 +171,7 @@ def as_friction(law, name: str = "`friction`") -> AbstractFriction:
     )
 
 
-def as_laws(friction, name: str = "`friction`") -> tuple[AbstractFriction, ...]:
+def as_laws(friction, name: str = _FRICTION) -> tuple[AbstractFriction, ...]:
     """A user's laws of friction: none, one, or a list."""
     if friction is None:
         return ()

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Inexact, PyTree
 
+from .._checks import check_callable
 from .._forms import fit_form, is_operator
 from .._numbers import cast_to, Time
 from ._base import AbstractFriction, MASS, Mechanics, Parts
@@ -62,11 +63,9 @@ class Drag(AbstractFriction):
         traced, if a shape does not fit bodies over the last axis of `p`, or the masses
         are not known.
         """
-        if not callable(coefficient):
-            coefficient = as_numbers(coefficient, _COEFFICIENT)
-        if not callable(medium) and medium is not None:
-            medium = as_numbers(medium, "`Drag(..., medium=...)`")
-        self.coefficient = coefficient
+        self.coefficient = _as_given(coefficient, _COEFFICIENT, "c(t, q, args)")
+        if medium is not None:
+            medium = _as_given(medium, "`Drag(..., medium=...)`", "w(t, q, args)")
         self.medium = medium
 
     def parts(self, mechanics: Mechanics) -> Parts:
@@ -111,6 +110,13 @@ class Drag(AbstractFriction):
         coefficients = _per_body(self.coefficient, p, _COEFFICIENT)
         medium = _of_medium(self.medium, p)
         return jtu.tree_map(leaf, p, _per_body(mass, p, MASS), coefficients, medium)
+
+
+def _as_given(x, name: str, signature: str) -> Numbers | Callable:
+    if not callable(x):
+        return as_numbers(x, name)
+    check_callable(x, name[1:-1], signature)
+    return x
 
 
 def _of_medium(medium, p: PyTree) -> PyTree:

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Inexact
 
+from .._checks import as_parameter
 from .._numbers import as_time, cast_to, Scalar, Time
 from ._exponential import expm1, expm1_ratio, gauss_legendre
 
@@ -197,6 +198,9 @@ class Power(AbstractLogScale):
         return zero & jnp.any((delta < 1) & (delta != 0))
 
 
+_LAWS = " A law of friction is passed with its numbers: `ConstantDamping(rate)`."
+
+
 class FunctionOfTime(AbstractLogScale):
     """Any function `eta(t)`; its increments are plain differences."""
 
@@ -204,7 +208,8 @@ class FunctionOfTime(AbstractLogScale):
     is_autonomous: ClassVar[bool] = False
 
     def __call__(self, t: Time) -> Inexact[Array, "..."]:
-        return cast_to(self.eta(t), as_time(t))
+        value = as_parameter(self.eta(t), "The value of `eta(t)`", _LAWS)
+        return cast_to(value, as_time(t))
 
     def increment(self, t: Time, h: Time) -> Inexact[Array, "..."]:
         return self(t + h) - self(t)

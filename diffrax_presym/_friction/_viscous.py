@@ -8,6 +8,7 @@ import jax.tree_util as jtu
 from jaxtyping import PyTree
 
 from .. import _tree as tree
+from .._checks import check_callable
 from .._forms import as_form, is_operator, multiply
 from .._numbers import Time
 from ._base import (
@@ -91,11 +92,9 @@ def ViscousDamping(coefficients) -> ViscousFriction | LocalFriction:
     a kinetic energy of known mass, and [`diffrax_presym.LagrangianSystem`][]. In the
     first the flow of drift and friction is exact, by $e^{-h C M^{-1}}$ and its
     integral, so that no scheme loses its order by it. A symmetric positive matrix $C$
-    damps; an antisymmetric one does no work, and the energy is kept. The force
-    $e \, v \times B$ on a charge $e$ in a uniform magnetic field $B$ is
-    `ViscousDamping(e * jnp.array([[0, -B[2], B[1]], [B[2], 0, -B[0]],
-    [-B[1], B[0], 0]]))`, and the Coriolis force in a frame that rotates with $\Omega$
-    has $2 m \Omega$ in place of $e B$ with the opposite sign.
+    damps; an antisymmetric one does no work, and the energy is kept: the force
+    $e \, v \times B$ on a charge $e$ in a uniform magnetic field $B$, and the Coriolis
+    force $-2 m \, \Omega \times v$ in a frame that rotates with $\Omega$.
 
     With numbers or arrays the cost is that of
     [`diffrax_presym.ConstantDamping`][]. With matrices and equal steps, in the loop of
@@ -108,6 +107,18 @@ def ViscousDamping(coefficients) -> ViscousFriction | LocalFriction:
 
     If $C$ depends on time or place, by a function, the friction is part of the kicks,
     and exact there at fixed positions: as [`diffrax_presym.PositionDamping`][].
+
+    !!! example
+
+        ```python
+        def cross_matrix(a):
+            return jnp.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
+
+        e, B = 1.5, jnp.array([0.0, 0.1, 3.0])
+        magnetic = ViscousDamping(e * cross_matrix(B))
+        m, Omega = 2.0, jnp.array([0.0, 0.2, 0.3])
+        coriolis = ViscousDamping(2 * m * cross_matrix(Omega))
+        ```
 
     **Arguments:**
 
@@ -136,8 +147,9 @@ def ViscousDamping(coefficients) -> ViscousFriction | LocalFriction:
             "velocity write `ViscousDamping(1.0)`."
         )
     if callable(coefficients) and not is_operator(coefficients):
+        check_callable(coefficients, COEFFICIENTS[1:-1], "C(t, q, args)")
         return LocalFriction(coefficients, per_velocity=True)
-    return ViscousFriction(as_form(coefficients, COEFFICIENTS, positive=False))
+    return ViscousFriction(as_form(coefficients, COEFFICIENTS))
 
 
 def PositionDamping(rate: Callable) -> LocalFriction:
@@ -168,10 +180,6 @@ def PositionDamping(rate: Callable) -> LocalFriction:
     `ValueError` if it is not a function, and when the solve is traced if it returns
     values of the wrong shape.
     """
-    if not callable(rate):
-        raise ValueError(
-            "`PositionDamping(rate)` must be a function `rate(t, q, args)`, but "
-            f"got {rate!r}. For a rate that does not depend on place write "
-            "`ConstantDamping(rate)`."
-        )
+    instead = " For a rate that does not depend on place write `ConstantDamping(rate)`."
+    check_callable(rate, "PositionDamping(rate)", "rate(t, q, args)", instead=instead)
     return LocalFriction(rate, per_velocity=False)

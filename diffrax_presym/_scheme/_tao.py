@@ -117,6 +117,10 @@ class PresymplecticTao(AbstractPresymplecticSolver):
     [`diffrax_presym.PresymplecticGauss`][] is faster to almost any error, preserves the
     structure in the phase space itself, and has no coupling to choose.
 
+    If the step is too long or the copies separate, a solve ends with
+    `RESULTS.nonfinite` or has no accuracy: compare its energies. Take shorter steps, or
+    a stronger coupling.
+
     ??? cite "Reference"
 
         Equations (tao_ham) to (tao_flow) of França, Jordan and Vidal (2021), after

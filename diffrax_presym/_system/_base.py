@@ -183,25 +183,30 @@ class AbstractSystem(dfx.AbstractTerm):
     def from_velocity(self, t: Time, y: tuple[Q, Q], args: PyTree = None) -> State:
         """The state `(q, p)` of positions and velocities `(q, v)`: by Newton's method
         from the momentum that is equal to the velocity."""
-        q, v = y
-        eps = max(float(jnp.finfo(x.dtype).eps) for x in jtu.tree_leaves(v))
-        size = lax.stop_gradient(tree.largest(v))
-        # Relative to the velocity, so that the tolerance is its rounding.
-        unit = jnp.where(size > 0, 1 / size, 1)
-        miss = lambda p: tree.sub(self.velocity(t, q, p, args), v)
-        residual = lambda p, _: tree.scale(unit, miss(p))
-        finder = optx.Newton(rtol=10 * eps, atol=10 * eps)
-        p = optx.root_find(residual, finder, v, max_steps=64, throw=False).value
-        # Rounding of the energy may be larger than that of the velocity.
-        missed = ~(tree.largest(residual(p, None)) <= eps**0.5)
-        message = "`from_velocity` found no momentum of this velocity."
-        return q, eqx.error_if(p, missed, message)
+        return y[0], _momentum(self, as_time(t), y, args)
 
     def to_velocity(self, t: Time, y: State, args: PyTree = None) -> tuple[Q, Q]:
         """Positions and velocities `(q, v)` of a state `(q, p)`: save them by
         `SaveAt(..., fn=system.to_velocity)`."""
         q, p = y
         return q, self.velocity(t, q, p, args)
+
+
+@eqx.filter_jit  # Outside of a solve, it would be compiled again by each call.
+def _momentum(system: AbstractSystem, t: Time, y: tuple[Q, Q], args: PyTree) -> P:
+    q, v = y
+    eps = max(float(jnp.finfo(x.dtype).eps) for x in jtu.tree_leaves(v))
+    size = lax.stop_gradient(tree.largest(v))
+    # Relative to the velocity, so that the tolerance is its rounding.
+    unit = jnp.where(size > 0, 1 / size, 1)
+    miss = lambda p: tree.sub(system.velocity(t, q, p, args), v)
+    residual = lambda p, _: tree.scale(unit, miss(p))
+    finder = optx.Newton(rtol=10 * eps, atol=10 * eps)
+    p = optx.root_find(residual, finder, v, max_steps=64, throw=False).value
+    # Rounding of the energy may be larger than that of the velocity.
+    missed = ~(tree.largest(residual(p, None)) <= eps**0.5)
+    message = "`from_velocity` found no momentum of this velocity."
+    return eqx.error_if(p, missed, message)
 
 
 def check_state(y: PyTree) -> None:

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
 from .. import _tree as tree
 from .._checks import as_positive, check_callable, scalar_fn
-from .._forms import as_form, divide, multiply
+from .._forms import as_mass, divide, is_symmetric, multiply
 from .._friction._base import MASS
 from .._friction._exponential import gauss_legendre
 from .._friction._linear import LinearFriction
@@ -80,10 +80,16 @@ class AbstractKinetic(eqx.Module):
         r"""The kinetic energy $T_s(p) = e^{-2s} \, T(e^s p)$, without overflow."""
 
 
+_OF_POSITIONS = (
+    " For a mass matrix that depends on the positions write `LagrangianSystem`."
+)
+
+
 class QuadraticKinetic(AbstractKinetic):
     r"""The kinetic energy $T(p) = \tfrac12 \, p \cdot M^{-1} p$."""
 
     mass: PyTree[Inexact[Array, "..."]] | lx.AbstractLinearOperator | None
+    symmetric: bool = eqx.field(static=True)
 
     def __init__(self, mass=None):
         """**Arguments:**
@@ -95,8 +101,10 @@ class QuadraticKinetic(AbstractKinetic):
                 for each degree of freedom. For `n` particles in three dimensions, with
                 `p` of shape `(n, 3)`, pass masses of shape `(n, 1)`.
             - A square matrix, with `p` a vector: symmetric and positive definite.
+            - An array with one dimension more than `p`: such a matrix for each vector
+                over the last axis of `p`.
             - A pytree of the structure of `p`, whose leaves are any of the above.
-            - A `lineax.AbstractLinearOperator` acting on `p`'s space.
+            - A symmetric `lineax.AbstractLinearOperator` acting on `p`'s space.
 
             A test particle without mass has no momentum. Let `p` be the momentum per
             unit mass of all bodies, `QuadraticKinetic()` with
@@ -105,10 +113,13 @@ class QuadraticKinetic(AbstractKinetic):
 
         **Raises:**
 
-        `ValueError` if a mass is known not to be positive, or if its shape does not fit
-        `p` (when the solve is traced).
+        `ValueError` if a mass is known not to be positive; and when the solve is
+        traced, if its shape does not fit `p`, or if it is a matrix that was not
+        symmetric when this was made. That is not checked of traced arrays, nor of
+        operators other than `lineax.MatrixLinearOperator`.
         """
-        self.mass = as_form(mass, MASS, positive=True)
+        self.mass = as_mass(mass, MASS, _OF_POSITIONS)
+        self.symmetric = is_symmetric(mass)
 
     is_quadratic: ClassVar[bool] = True
     is_autonomous: ClassVar[bool] = True
@@ -118,11 +129,11 @@ class QuadraticKinetic(AbstractKinetic):
         return energy / 2
 
     def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
-        return divide(self.mass, p, MASS, "p")
+        return divide(self.mass, p, MASS, "p", self.symmetric)
 
     def momentum(self, v: PyTree) -> PyTree:
         """The momentum $M v$ of a velocity."""
-        return multiply(self.mass, v, MASS, "q")
+        return multiply(self.mass, v, MASS, "q", self.symmetric)
 
     def prepare(self, friction, t, h, order):
         return None if friction is None else friction.prepare(t, h, order)

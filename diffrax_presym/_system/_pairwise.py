@@ -1,7 +1,6 @@
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
@@ -17,11 +16,12 @@ class _PairwisePotential(eqx.Module):
     box: Float[Array, "..."] | None
 
     def __call__(self, t: Time, q: PyTree, args: PyTree = None) -> Scalar:
-        if not isinstance(q, jax.Array) or q.ndim != 2:
+        if not eqx.is_array_like(q) or jnp.ndim(q) != 2:
             raise ValueError(
                 "`pairwise_potential` needs positions in one array of shape "
                 f"`(n, dim)`, a row for each of `n` particles, but got {q!r}."
             )
+        q = jnp.asarray(q)
         n = len(q)
         if self.masses is not None and self.masses.shape != (n,):
             raise ValueError(

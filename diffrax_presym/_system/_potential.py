@@ -8,13 +8,17 @@ from jaxtyping import Array, Inexact, PyTree
 
 from .. import _tree as tree
 from .._checks import check_callable, match, scalar_fn
-from .._forms import as_form, multiply
+from .._forms import as_form, is_symmetric, multiply
 from .._friction._base import AbstractFriction
 from .._numbers import Scalar, Time
 from ._kinetic import AbstractKinetic
 
 
 _STIFFNESS = "`QuadraticPotential(stiffness)`"
+_NO_FUNCTION = (
+    " A potential energy that is a function is passed as it is: "
+    "`MechanicalSystem(kinetic, V)`."
+)
 
 
 class AbstractPotential(eqx.Module):
@@ -38,6 +42,7 @@ class QuadraticPotential(AbstractPotential):
     """
 
     stiffness: PyTree[Inexact[Array, "..."]] | lx.AbstractLinearOperator | None
+    symmetric: bool = eqx.field(static=True)
 
     def __init__(self, stiffness=None):
         """**Arguments:**
@@ -49,21 +54,27 @@ class QuadraticPotential(AbstractPotential):
             - An array with as many dimensions as `q`, and broadcastable to it: a
                 stiffness for each degree of freedom.
             - A symmetric matrix, with `q` a vector.
+            - An array with one dimension more than `q`: a symmetric matrix for each
+                vector over the last axis of `q`.
             - A pytree of the structure of `q`, whose leaves are any of the above.
             - A symmetric `lineax.AbstractLinearOperator` acting on `q`'s space.
 
         **Raises:**
 
-        `ValueError` if a stiffness is not a real number or array, or if its shape does
-        not fit `q` (when the solve is traced).
+        `ValueError` if a stiffness is not a finite real number or array; and when the
+        solve is traced, if its shape does not fit `q`, or if it is a matrix that was
+        not symmetric when this was made. That is not checked of traced arrays, nor of
+        operators other than `lineax.MatrixLinearOperator`.
         """
-        self.stiffness = as_form(stiffness, _STIFFNESS, positive=False)
+        self.stiffness = as_form(stiffness, _STIFFNESS, _NO_FUNCTION)
+        self.symmetric = is_symmetric(stiffness)
 
     def __call__(self, t: Time, q: PyTree, args: PyTree = None) -> Scalar:
         return -tree.dot(q, self.force(t, q)) / 2
 
     def force(self, t: Time, q: PyTree, args: PyTree = None) -> PyTree:
-        return tree.scale(-1, multiply(self.stiffness, q, _STIFFNESS, "q"))
+        product = multiply(self.stiffness, q, _STIFFNESS, "q", self.symmetric)
+        return tree.scale(-1, product)
 
 
 class ForceField(AbstractPotential):

@@ -33,7 +33,7 @@ def energy(system: AbstractSystem, ts: Times, ys: State, args: PyTree = None) ->
     An array with an entry for each time. Where nothing was saved (`ts` is infinite
     beyond the last step of `SaveAt(steps=True)`) it is not finite either.
     """
-    return _at_each(lambda t, y: system.energy(t, *y, args=args), ts, ys)
+    return _at_each(_energy, system, ts, ys, args)
 
 
 def energy_error(
@@ -57,15 +57,7 @@ def energy_error(
 
     As [`diffrax_presym.diagnostics.energy`][].
     """
-
-    def power(t, y):
-        energy = lambda t, q, p: system.energy(t, q, p, args)
-        explicit, slope, _ = jax.grad(energy, argnums=(0, 1, 2))(t, *y)
-        velocity, force = system.vf(t, y, args)
-        done = tree.dot(velocity, tree.sum(force, slope))
-        return cast_to(explicit, done) + done
-
-    done = _integral(power, system, ts, ys, args)
+    done = _integral(_power, system, ts, ys, args)
     balance = energy(system, ts, ys, args)
     return balance - balance[0] - done
 
@@ -80,7 +72,7 @@ def power_lost(
 
     As [`diffrax_presym.diagnostics.energy`][].
     """
-    return _at_each(lambda t, y: _power_lost(system, t, y, args), ts, ys)
+    return _at_each(_power_lost, system, ts, ys, args)
 
 
 def energy_lost(
@@ -95,8 +87,23 @@ def energy_lost(
 
     As [`diffrax_presym.diagnostics.energy`][].
     """
-    power = lambda t, y: _power_lost(system, t, y, args)
-    return _integral(power, system, ts, ys, args)
+    return _integral(_power_lost, system, ts, ys, args)
+
+
+# Functions of the module are compiled once for each system and shape.
+
+
+def _energy(system: AbstractSystem, t, y: State, args: PyTree):
+    return system.energy(t, *y, args=args)
+
+
+def _power(system: AbstractSystem, t, y: State, args: PyTree):
+    """The power of all that changes the energy."""
+    energy = lambda t, q, p: system.energy(t, q, p, args)
+    explicit, slope, _ = jax.grad(energy, argnums=(0, 1, 2))(t, *y)
+    velocity, force = system.vf(t, y, args)
+    done = tree.dot(velocity, tree.sum(force, slope))
+    return cast_to(explicit, done) + done
 
 
 def _power_lost(system: AbstractSystem, t, y: State, args: PyTree):
@@ -104,6 +111,7 @@ def _power_lost(system: AbstractSystem, t, y: State, args: PyTree):
     return -tree.dot(velocity, system.friction_force(t, *y, args))
 
 
+@eqx.filter_jit
 def _integral(
     power: Callable, system: AbstractSystem, ts: Times, ys: State, args: PyTree
 ) -> Times:
@@ -113,8 +121,11 @@ def _integral(
     tolerance = 100 * eps
 
     def one(t0, t1, y0):
-        field = lambda t, x, _: (system.vf(t, x[0], args), power(t, x[0]))
-        zero = jnp.zeros_like(power(t0, y0))
+        field = lambda t, x, _: (
+            system.vf(t, x[0], args),
+            power(system, t, x[0], args),
+        )
+        zero = jnp.zeros_like(power(system, t0, y0, args))
         # Nothing was saved beyond the last step.
         t1 = jnp.where(jnp.isfinite(t1), t1, t0)
         sol = dfx.diffeqsolve(
@@ -130,9 +141,10 @@ def _integral(
         return jnp.where(good, sol.ys[1][0], jnp.nan)
 
     starts = jtu.tree_map(lambda y: y[:-1], ys)
-    parts = eqx.filter_jit(jax.vmap(one))(ts[:-1], ts[1:], starts)
+    parts = jax.vmap(one)(ts[:-1], ts[1:], starts)
     return jnp.concatenate([jnp.zeros(1, parts.dtype), jnp.cumsum(parts)])
 
 
-def _at_each(fn: Callable, ts: Times, ys: State):
-    return eqx.filter_jit(jax.vmap(fn))(as_time(ts), ys)
+@eqx.filter_jit
+def _at_each(fn: Callable, system: AbstractSystem, ts: Times, ys: State, args: PyTree):
+    return jax.vmap(lambda t, y: fn(system, t, y, args))(as_time(ts), ys)
