@@ -18,7 +18,8 @@ class ChosenStep(NamedTuple):
         neither `jax.jit` nor `equinox.filter_jit` compile the solve again.
     - `steps`: the number of steps that the solve takes.
     - `error`: the expected error, relative to the tolerance: at most 1.
-    - `order`: the measured order, `nan` if errors are below rounding.
+    - `order`: the measured order, `nan` if errors are those of rounding, or far below
+        the tolerance with the fewest steps.
     - `claimed_order`: the order of the scheme, if the solve tells it: with
         [`diffrax_presym.FixedStepAdjoint`][]; otherwise `None`.
     - `on_grid`: whether the step divides the spacing of the saved times, or is a
@@ -43,7 +44,7 @@ class ChosenStep(NamedTuple):
         tried = sorted({trial.steps: trial.error for trial in self.trials}.items())
         show = lambda error: f"{error:.1e}" if error < math.inf else "not finite"
         trials = ", ".join(f"{n} steps: {show(error)}" for n, error in tried)
-        order = "below rounding" if math.isnan(self.order) else f"{self.order:.1f}"
+        order = "unknown" if math.isnan(self.order) else f"{self.order:.1f}"
         claim = self.claimed_order
         scheme = "" if claim is None else f", that of the scheme {claim}"
         note = (

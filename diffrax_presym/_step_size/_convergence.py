@@ -150,8 +150,9 @@ def find_steps(
                 return trial
 
             smooth = _is_smooth(law, high, grid, measure)
-            known = not law.agrees or law.exceeds(0.75)
-            order = law.orders[-1] if known else math.nan
+            rounding = max(x.error for x in law.ladder[-2:]) < 1e-3
+            rounding = rounding or (law.agrees and not law.exceeds(0.75))
+            order = math.nan if rounding else law.orders[-1]
             choice = Choice(high, order, law.claimed, smooth, grid)
             if smooth or doubted:
                 best = _smallest(law, high, grid, measure) if smooth else high
@@ -179,7 +180,9 @@ def _is_smooth(law: Law, high: Trial, grid: Grid, measure) -> bool:
         return False
     unit = grid.intervals or 1
     unit = unit if high.number % unit == 0 else 1
-    factors = (1.5,) if law.exceeds(0.65 * (law.claimed or 2)) else (1.5, 1.25)
+    # Twice by chance is rare where the order is high.
+    settled = law.exceeds(0.65 * (law.claimed or 2))
+    factors = (1.5, 1.25) if not settled else (1.5,) if (law.claimed or 2) < 6 else ()
     # Even, since the others are odd: these see one phase in the middle of the span.
     numbers = (2 * unit * math.ceil(x * high.number / unit / 2) for x in factors)
     for trial in map(measure, dict.fromkeys(numbers)):
