@@ -180,9 +180,8 @@ def _is_smooth(law: Law, high: Trial, grid: Grid, measure) -> bool:
         return False
     unit = grid.intervals or 1
     unit = unit if high.number % unit == 0 else 1
-    # Twice by chance is rare where the order is high.
     settled = law.exceeds(0.65 * (law.claimed or 2))
-    factors = (1.5, 1.25) if not settled else (1.5,) if (law.claimed or 2) < 6 else ()
+    factors = (1.5,) if settled else (1.5, 1.25)
     # Even, since the others are odd: these see one phase in the middle of the span.
     numbers = (2 * unit * math.ceil(x * high.number / unit / 2) for x in factors)
     for trial in map(measure, dict.fromkeys(numbers)):
