@@ -79,7 +79,7 @@ def measure(problem, ts, table):
         cost = sum(trial.steps for trial in step.trials) / step.steps
         cells = step.error * rtol, got * rtol, got, step.order, cost, seconds
         table.row(problem.name, rtol, str(step.steps), *cells)
-        yield got, got / step.error
+        yield got, got / step.error, step.smooth
 
 
 def main():
@@ -99,12 +99,13 @@ def main():
             ts = None if at_end else np.linspace(0, problem.t1, SAVED + 1)[1:]
             ratios += measure(problem, ts, table)
             jax.clear_caches()
-        got, predicted = map(np.array, zip(*ratios, strict=True))
+        got, predicted, smooth = map(np.array, zip(*ratios, strict=True))
         print(
             f"\n{label}, error got over tolerance: mean "
             f"{np.exp(np.mean(np.log(got))):.2f}, largest {np.max(got):.2f}, at least "
             f"a third in {np.sum(got >= 1 / 3)} of {len(got)}\nerror over predicted: "
-            f"{np.min(predicted):.2f} to {np.max(predicted):.2f}"
+            f"{np.min(predicted):.2f} to {np.max(predicted):.2f}\n"
+            f"noted as not smooth: {np.sum(~smooth)}"
         )
 
 

@@ -1,4 +1,4 @@
-# pyright: reportOptionalOperand=false
+# pyright: reportOptionalOperand=false, reportOptionalMemberAccess=false
 """`choose_step`: the tolerance is reached, by a step not much shorter than needed; and
 `StepsBetween`, for forces with kinks.
 
@@ -12,6 +12,7 @@ from typing import Any
 import diffrax as dfx
 import equinox as eqx
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ def cosine(t, q, args):
     return -jnp.sum(jnp.cos(q))
 
 
-def system_of(potential, damping=0.1):
+def system_of(potential, damping: Any = 0.1):
     friction = dps.ConstantDamping(damping)
     return dps.MechanicalSystem(dps.QuadraticKinetic(), potential, friction)
 
@@ -42,13 +43,15 @@ IRREGULAR = jnp.sort(jax.random.uniform(jax.random.key(0), (30,), maxval=20.0))
 
 def solve_of(system, solver, t0, t1, y0, *, ts=None, args=None, **options):
     """A solve that is saved at given times, or at its end."""
-    saveat = dfx.SaveAt(t1=True) if ts is None else dfx.SaveAt(ts=ts)
-    given = {"adjoint": dps.FixedStepAdjoint(), "throw": False, "max_steps": None}
+    given: dict[str, Any] = {
+        "saveat": dfx.SaveAt(t1=True) if ts is None else dfx.SaveAt(ts=ts)
+    }
+    given |= {"adjoint": dps.FixedStepAdjoint(), "throw": False, "max_steps": None}
 
     @jax.jit
     def solve(dt0) -> Any:
         return dfx.diffeqsolve(
-            *(system, solver, t0, t1, dt0, y0, args), saveat=saveat, **(given | options)
+            *(system, solver, t0, t1, dt0, y0, args), **(given | options)
         )
 
     return solve
@@ -126,15 +129,27 @@ def test_grids(ts, number):
     assert intervals(shifted, start, end) == number
 
 
-def test_no_more_than_twice_as_many_steps_for_the_grid():
-    # 1009 is a prime: it has no divisors, so that steps would be ten times too short.
-    prime, divisible = (
-        choose(PENDULUM, RKN6, *LONG, 1e-4, ts=jnp.linspace(0.0, 20.0, n))
-        for n in (1010, 1009)
-    )
-    assert not prime.on_grid and prime.steps < 200
-    assert divisible.on_grid and 1008 % divisible.steps == 0
-    assert divisible.steps <= 2 * prime.steps
+@pytest.mark.variants(6)
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-8])
+@pytest.mark.parametrize(
+    "ts",
+    [np.linspace(0, 20, 501), np.array([2.0, 4.0, 14.0]), np.arange(0.25, 20, 0.5)],
+)
+def test_no_other_step_tried_is_cheaper(ts, tolerance):
+    # A saved time inside of a step takes a step more.
+    def cost(n):
+        ends = ts * n / 20.0
+        return n + np.sum(np.abs(ends - np.round(ends)) > 1e-9)
+
+    solve = solve_of(PENDULUM, RKN6, *LONG, ts=jnp.asarray(ts))
+    step = dps.choose_step(solve, 0.0, 20.0, rtol=tolerance, atol=tolerance)
+    good = [trial for trial in step.trials if trial.error <= 1]
+    assert step.smooth and cost(step.steps) == min(cost(x.steps) for x in good)
+    # Of those that cost as much the one with the most steps is the most accurate.
+    assert len(ts) < 500 or step.steps % 500 == 0
+    exact = flat(solve(step.dt0 / 2).ys)
+    got = np.max(np.abs(flat(solve(step.dt0).ys) - exact) / (1 + np.abs(exact)))
+    assert got <= 1.05 * tolerance * max(step.error, 1e-3)
 
 
 def test_steps_do_not_follow_the_phase_of_a_force():
@@ -150,6 +165,95 @@ def test_what_is_exact_takes_one_step():
     free = dps.MechanicalSystem(dps.QuadraticKinetic(), lambda t, q, args: 0.0 * q[0])
     step = choose(free, dps.Strang(), *LONG, 1e-6)
     assert step.steps == 1 and np.isnan(step.order)
+
+
+def test_a_short_push_from_rest():
+    # Solves with few steps miss it, and find no motion at all.
+    def push(t):
+        x = (t - 0.1935) / 0.03
+        return jnp.where(jnp.abs(x) < 1, (1 - x**2) ** 4, 0.0)
+
+    pushed = lambda t, q, args: jnp.sum(q**2) / 2 - push(t) * jnp.sum(q)
+    problem = system_of(pushed, 0.0), dps.Strang(), 0.0, 2.0, (jnp.zeros(1),) * 2
+    step = choose(*problem, 1e-4)
+    sol = solve_of(*problem)(step.dt0)
+    rhs = lambda t, y: np.array([y[1], float(push(t)) - y[0]])
+    options: dict[str, Any] = {"rtol": 1e-12, "atol": 1e-14, "max_step": 0.01}
+    exact = scipy.integrate.solve_ivp(rhs, (0, 2), np.zeros(2), "DOP853", **options)
+    assert np.max(np.abs(flat(sol.ys) - exact.y[:, -1])) <= 1.05e-4
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")  # Diffrax fills integers with inf.
+@pytest.mark.parametrize(
+    "saved", [lambda q: jnp.round(50 * q).astype(int), lambda q: lax.complex(0 * q, q)]
+)
+def test_errors_of_integers_and_complex_values(saved):
+    fn = lambda t, y, args: saved(y[0])
+    problem = PENDULUM, RKN4, *LONG
+    solve = solve_of(*problem, saveat=dfx.SaveAt(t1=True, fn=fn))
+    step = dps.choose_step(solve, 0.0, 20.0, rtol=0.0, atol=1e-3)
+    fine = solve_of(*problem)(step.dt0 / 3).ys[0]
+    assert np.max(np.abs(solve(step.dt0).ys - saved(fine))) <= 1.05e-3
+
+
+# A force of -1 that jumps to +1: whether a step sees it early or late is chance.
+
+
+def after_a_jump(a):
+    """The state at the time 2, from one and 0.3."""
+    b = 2 - a
+    return np.array([1.6 - a**2 / 2 - a * b + b**2 / 2, 0.3 - a + b])
+
+
+def check_jumps(solver, jumps):
+    system = system_of(lambda t, q, a: jnp.sum(q) * jnp.where(t < a, 1.0, -1.0), 0.0)
+
+    @jax.jit
+    def solve(dt0, a):
+        y0 = jnp.array([1.0]), jnp.array([0.3])
+        options: dict[str, Any] = {"adjoint": dps.FixedStepAdjoint(), "max_steps": None}
+        return dfx.diffeqsolve(system, solver, 0.0, 2.0, dt0, y0, a, **options)
+
+    for a, tolerance in itertools.product(jumps, (1e-3, 1e-4, 1e-5)):
+        at = lambda h, a=a: solve(h, a)
+        try:
+            step = dps.choose_step(at, 0.0, 2.0, rtol=tolerance, atol=tolerance)
+        except RuntimeError as error:
+            assert "no regular convergence" in str(error) or "needs" in str(error)
+            continue
+        exact = after_a_jump(a)
+        error = np.abs(flat(solve(step.dt0, a).ys) - exact)
+        if np.max(error / (1 + np.abs(exact))) > 2 * tolerance:
+            assert not step.smooth and "StepsBetween" in str(step)
+
+
+JUMPS = np.random.default_rng(7).uniform(0.05, 1.95, 100)
+
+
+@pytest.mark.parametrize(
+    "solver, jumps",
+    [
+        (dps.PresymplecticLeapfrog(), [0.9953608518777141, *JUMPS[:8]]),
+        (RKN6, [1.3071239464485345, 0.777, *JUMPS[:8]]),
+    ],
+)
+def test_jumps_inside_of_a_step_have_a_note(solver, jumps):
+    check_jumps(solver, jumps)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "solver",
+    [
+        dps.Strang(),
+        dps.PresymplecticLeapfrog(),
+        dps.BlanesMoanRKN4(),
+        RKN6,
+        dps.BlanesCasasRKN8(),
+    ],
+)
+def test_many_jumps_have_a_note(solver):
+    check_jumps(solver, JUMPS)
 
 
 RKN4, GAUSS = dps.BlanesMoanRKN4(), dps.PresymplecticGauss(2)
@@ -219,6 +323,27 @@ def test_tolerances_that_cannot_be_reached(
         choose(system_of(potential), solver, *LONG, tolerance, max_steps)
 
 
+def test_what_does_not_converge_ends_soon():
+    # Chaotic: no two solves agree.
+    chaotic = system_of(lambda t, q, args: cosine(t, q, args) * (1 + jnp.cos(t)), 0.0)
+    trials = []
+    solve = solve_of(chaotic, RKN6, 0.0, 1000.0, Y0)
+    with pytest.raises(RuntimeError, match="no regular convergence with up to 32"):
+        dps.choose_step(
+            *(solve, 0.0, 1000.0), rtol=1e-3, atol=1e-3, on_trial=trials.append
+        )
+    assert 8 < len(trials) < 15 and trials[-1].steps < 20000
+
+
+def test_trials_are_shown():
+    trials = []
+    solve = solve_of(PENDULUM, RKN6, *LONG)
+    step = dps.choose_step(
+        solve, 0.0, 20.0, rtol=1e-6, atol=1e-6, on_trial=trials.append
+    )
+    assert step.trials == tuple(trials)
+
+
 def saves_steps(dt0):
     saveat = dfx.SaveAt(steps=True)
     return dfx.diffeqsolve(PENDULUM, RKN6, 0.0, 20.0, dt0, Y0, saveat=saveat)
@@ -231,7 +356,7 @@ def between(times):
     )
 
 
-@pytest.mark.variants(14)
+@pytest.mark.variants(16)
 @pytest.mark.parametrize(
     "changes, message",
     [
@@ -240,6 +365,8 @@ def between(times):
         ({"atol": float("nan")}, "atol=.* but got nan"),
         ({"atol": "small"}, "atol=.* but got 'small'"),
         ({"max_steps": 0}, "max_steps=.* must be a positive integer, but got 0"),
+        ({"t0": 20.0, "t1": 0.0}, "`t0` and `t1` must be those"),
+        ({"solve": lambda h: solve_of(PENDULUM, RKN6, *LONG)(0.1)}, "not use `dt0`"),
         ({"t1": 0.0}, "two different finite times"),
         ({"t1": 5.0}, "needs the times of the solve"),
         ({"t1": float("inf")}, "two different finite times"),
@@ -271,9 +398,18 @@ def test_the_solve_is_traced_once_for_the_choice_and_its_use(jit):
     assert len(traced) == 1
 
 
-def test_traced_input():
-    with pytest.raises(ValueError, match=r"outside of `jax.jit`"):
-        jax.jit(lambda t1: choose(PENDULUM, RKN6, 0.0, t1, Y0, 1e-3).dt0)(1.0)
+@pytest.mark.parametrize("transform", [jax.jit, jax.grad, lambda f: jax.vmap(f)])
+def test_traced_input(transform):
+    def of_start(x):
+        y0 = Y0[0] * x, Y0[1]
+        return choose(PENDULUM, RKN6, 0.0, 20.0, y0, 1e-3).dt0
+
+    of_time = lambda t1: choose(PENDULUM, RKN6, 0.0, t1, Y0, 1e-3).dt0
+    of_tolerance = lambda x: choose(PENDULUM, RKN6, *LONG, x).dt0
+    x = jnp.ones(2) if transform not in (jax.jit, jax.grad) else 1.0
+    for f in (of_start, of_time, of_tolerance):
+        with pytest.raises(ValueError, match=r"outside of `jax.jit`, `jax.grad`"):
+            transform(f)(x)
 
 
 # `StepsBetween`, with a force from a table.

@@ -1,15 +1,12 @@
 import math
 from collections.abc import Callable
-from itertools import takewhile
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from ._convergence import doubling, find_steps, Solution, Trial
-from ._grid import intervals
+from ._convergence import find_steps, Trial
+from ._solution import check_times, check_tolerance, Solution
 
 
 class ChosenStep(NamedTuple):
@@ -21,11 +18,15 @@ class ChosenStep(NamedTuple):
         neither `jax.jit` nor `equinox.filter_jit` compile the solve again.
     - `steps`: the number of steps that the solve takes.
     - `error`: the expected error, relative to the tolerance: at most 1.
-    - `order`: the measured order, `nan` if errors are below rounding.
+    - `order`: the measured order, `nan` if errors are those of rounding, or far below
+        the tolerance with the fewest steps.
     - `claimed_order`: the order of the scheme, if the solve tells it: with
         [`diffrax_presym.FixedStepAdjoint`][]; otherwise `None`.
     - `on_grid`: whether the step divides the spacing of the saved times, or is a
         multiple of it.
+    - `smooth`: whether the errors of solves follow the law of convergence. If not, as
+        where a force jumps inside of a step, the error of one solve says little about
+        that of another, and may be larger than expected.
     - `trials`: the numbers of steps that were tried, and the errors found.
     """
 
@@ -35,6 +36,7 @@ class ChosenStep(NamedTuple):
     order: float
     claimed_order: int | None
     on_grid: bool
+    smooth: bool
     trials: tuple[Trial, ...]
 
     def __str__(self) -> str:
@@ -42,20 +44,18 @@ class ChosenStep(NamedTuple):
         tried = sorted({trial.steps: trial.error for trial in self.trials}.items())
         show = lambda error: f"{error:.1e}" if error < math.inf else "not finite"
         trials = ", ".join(f"{n} steps: {show(error)}" for n, error in tried)
-        order = "below rounding" if math.isnan(self.order) else f"{self.order:.1f}"
+        order = "unknown" if math.isnan(self.order) else f"{self.order:.1f}"
         claim = self.claimed_order
         scheme = "" if claim is None else f", that of the scheme {claim}"
-        note = ""
-        if claim is not None and self.order < claim / 2 and claim > 2:
-            note = (
-                " The order is lower than that of the scheme: the force or the "
-                "friction is not smooth. If it has kinks or jumps at known times, "
-                "write `stepsize_controller=StepsBetween(times)`."
-            )
+        note = (
+            " The errors do not fall as those of a smooth motion, and may be larger "
+            "than expected. If the force or the friction has kinks or jumps at known "
+            "times, write `stepsize_controller=StepsBetween(times)`."
+        )
         return (
             f"dt0={self.dt0:.6g}, {self.steps} steps, expected error "
             f"{self.error:.2g} of the tolerance. Measured order {order}{scheme}. "
-            f"Errors over the tolerance: {trials}.{note}"
+            f"Errors over the tolerance: {trials}.{'' if self.smooth else note}"
         )
 
 
@@ -67,6 +67,7 @@ def choose_step(
     rtol: float,
     atol: float,
     max_steps: int = 1_000_000,
+    on_trial: Callable[[Trial], Any] | None = None,
 ) -> ChosenStep:
     r"""The constant step size with which a solve reaches a tolerance, per entry of the
     solution.
@@ -82,13 +83,16 @@ def choose_step(
 
     The problem is solved with more and more steps, each time about twice as many, until
     three solves agree with an order, by Richardson extrapolation, and the tolerance is
-    reached. Then a smaller number of steps is searched, whose errors are measured
-    against the finest solve: about as long as ten solves with the chosen step.
+    reached. One or two more solves then have to confirm that errors fall as those of a
+    smooth motion, with steps that have another phase; if they do not, the steps are
+    doubled once more, and the result has a note: [`diffrax_presym.ChosenStep`][] with
+    `smooth=False`. Then a smaller number of steps is searched, whose errors are
+    measured against the finest solve: about as long as ten solves with the chosen step.
 
-    The step divides the span. If the saved times are on a grid that divides the span,
-    the step also divides the spacing of the grid or is a multiple of it, unless this
-    takes more than twice as many steps. The error may then be much smaller than aimed
-    at.
+    The step divides the span. A saved time inside of a step costs a step more, as in
+    [`diffrax_presym.FixedStepAdjoint`][]. So if the saved times are on a grid that
+    divides the span, and steps that end at all of them cost no more, such a step is
+    chosen. The error may then be much smaller than aimed at.
 
     It needs concrete numbers, so it is called outside of `jax.jit`. It knows only the
     solve that it is given: for other parameters choose another step, and in a batch
@@ -122,7 +126,11 @@ def choose_step(
         both zero. The latter in the units of the state: entries that pass through zero
         need one.
     - `max_steps`: the largest number of steps of a trial solve. That is about four
-        times the number of steps that can be chosen.
+        times the number of steps that can be chosen. If three doublings in succession,
+        from 2000 steps or a 500th of it on, bring the tolerance no closer, it is an
+        error before that.
+    - `on_trial`: a function that is called with each trial as soon as its error is
+        known. Write `on_trial=print` to see them all. Defaults to none.
 
     **Returns:**
 
@@ -130,7 +138,8 @@ def choose_step(
 
     **Raises:**
 
-    `ValueError` if an argument is not valid or is traced. `RuntimeError` if the
+    `ValueError` if an argument or the solution is not valid or is traced, or if the
+    solve does not use its step. `RuntimeError` if the
     tolerance cannot be reached: in this precision, because solves with more steps stop
     converging; within `max_steps`; or because no solve is finite. A solve that fails
     or is not finite is not an error otherwise, but one with a step that is too large.
@@ -156,55 +165,26 @@ def choose_step(
             "`choose_step(max_steps=...)` must be a positive integer, but got "
             f"{max_steps!r}."
         )
+    trials: list[Trial] = []
+
+    def report(trial: Trial):
+        trials.append(trial)
+        if on_trial is not None:
+            on_trial(trial)
+
     length = lambda n: jax.device_put((t1 - t0) / n)
     run = lambda n: Solution.of(n, solve, length(n))
-    # Of a solve that fails, the saved times are not known.
-    tried = map(run, takewhile(lambda n: n <= max_steps, doubling(4)))
-    first = next((x for x in tried if x.finite), None)
-    grid = None
-    if first is not None:
-        if not np.all(np.abs(first.ts - t0) <= abs(t1 - t0) * (1 + 1e-6)):
-            raise ValueError(
-                f"`choose_step(solve, t0, t1)` needs the times of the solve, but got "
-                f"{t0} and {t1}, and the solve saves at times up to "
-                f"{np.max(np.abs(first.ts - t0)):.6g} from `t0`."
-            )
-        grid = intervals(first.ts, t0, t1)
-    best, convergence = find_steps(run, tolerances, grid, max_steps)
+    best, order, claimed, smooth, grid = find_steps(
+        run, (t0, t1), tolerances, max_steps, report
+    )
+    every = grid.intervals
     return ChosenStep(
         dt0=length(best.number),
         steps=best.steps,
         error=best.error,
-        order=convergence.order,
-        claimed_order=convergence.claimed,
-        on_grid=grid is not None
-        and (best.number % grid == 0 or grid % best.number == 0),
-        trials=tuple(convergence.trials),
+        order=order,
+        claimed_order=claimed,
+        on_grid=bool(every) and (best.number % every == 0 or every % best.number == 0),
+        smooth=smooth,
+        trials=tuple(trials),
     )
-
-
-def check_times(t0, t1, name: str) -> tuple[float, float]:
-    if any(isinstance(x, Tracer) for x in jax.tree.leaves((t0, t1))):
-        raise ValueError(
-            f"`{name}` solves the problem several times, and needs concrete numbers, "
-            "but got traced ones. Call it outside of `jax.jit`, `jax.grad` and "
-            "`jax.vmap`, and pass its result to the transformed function."
-        )
-    if np.shape(t0) or np.shape(t1) or not np.isfinite(t1 - t0) or t0 == t1:
-        raise ValueError(
-            f"`{name}` needs two different finite times `t0` and `t1`, but got "
-            f"{t0} and {t1}."
-        )
-    return float(t0), float(t1)
-
-
-def check_tolerance(x, name: str) -> float:
-    try:
-        value = float(x)
-    except (TypeError, ValueError):
-        value = math.nan
-    if not 0 <= value < math.inf:
-        raise ValueError(
-            f"`{name}` must be a number that is not negative, but got {x!r}."
-        )
-    return value

@@ -1,19 +1,26 @@
-"""Convergence of solves with more and more steps, and the fewest that suffice."""
+"""Solves with more and more steps until they converge, and the cheapest that suffices.
 
-import contextlib
-import logging
+An error is the difference to the finest solution, over the tolerance, corrected by the
+law of convergence for the error of that.
+"""
+
+import itertools
 import math
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import diffrax as dfx
-import jax
 import numpy as np
-from jaxtyping import Array
+
+from ._grid import Grid
+from ._solution import scaled_error, Solution
 
 
 # The error that is aimed at, and that with which the search ends, over the tolerance.
 AIM, ENOUGH = 0.6, 0.4
+# With fewer steps solves may all miss a short push, and agree on that.
+SEEING = 50
+# With fewer steps these may be too long for the motion, and not converge for that.
+PATIENCE = 2000
 
 
 class Trial(NamedTuple):
@@ -24,307 +31,174 @@ class Trial(NamedTuple):
     error: float
     number: int  # of steps that was asked for
 
+    def order(self, finer: "Trial") -> float:
+        """With which errors fall, if that is known."""
+        if (
+            not 0
+            < min(self.error, finer.error)
+            <= max(self.error, finer.error)
+            < np.inf
+        ):
+            return math.nan
+        return math.log(self.error / finer.error) / math.log(finer.steps / self.steps)
 
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Without the traceback that JAX logs where a solve fails, as a trial may."""
-    logger = logging.getLogger("jax._src.callback")
-    disabled, logger.disabled = logger.disabled, True
-    try:
-        yield
-    finally:
-        logger.disabled = disabled
+
+class Law(NamedTuple):
+    """How solves converge: the steps tried, each with the difference to the next
+    solution in place of its error, and the finest solution."""
+
+    ladder: tuple[Trial, ...]
+    finest: Solution
+    claimed: int | None
+    tolerances: tuple[float, float]
+
+    def add(self, finer: Solution) -> "Law":
+        law = self._replace(finest=finer, claimed=finer.order or self.claimed)
+        last = self.finest
+        step = Trial(last.steps, law.difference(last), last.number)
+        return law._replace(ladder=(*self.ladder, step))
+
+    @property
+    def orders(self) -> list[float]:
+        pairs = itertools.pairwise(self.ladder)
+        return [math.nan, math.nan, *(a.order(b) for a, b in pairs)]
+
+    @property
+    def least(self) -> float:
+        """The lowest order of a smooth problem."""
+        return (self.claimed or min(max(self.orders[-1], 1), 4)) / 2 + 0.4
+
+    def exceeds(self, order: float, last: int | None = None) -> bool:
+        """Whether the last two orders, or earlier ones, are at least this one."""
+        return all(x >= order for x in self.orders[:last][-2:])
+
+    @property
+    def converges(self) -> bool:
+        # An order far above the claim is that of leaving an unstable step behind.
+        most = 2 * (self.claimed or 10) + 1
+        return self.exceeds(0.75) or self.least - 0.4 <= self.orders[-1] <= most
+
+    @property
+    def agrees(self) -> bool:
+        """Whether three solves do: to rounding, or exactly."""
+        two = self.ladder[-2:]
+        return two[0].steps >= SEEING and max(x.error for x in two) <= 0.5
+
+    def difference(self, solution: Solution) -> float:
+        if not (solution.finite and self.finest.finite):
+            return math.inf
+        return scaled_error(solution.leaves, self.finest.leaves, *self.tolerances)
+
+    def trial(self, solution: Solution) -> Trial:
+        error, steps, order = self.difference(solution), solution.steps, self.orders[-1]
+        order = order if order >= 0.75 else (self.claimed or 2)
+        if steps < self.finest.steps:
+            error /= 1 - (steps / self.finest.steps) ** order
+        elif error <= 1:
+            # At least as fine as the finest: an error that falls from the last one.
+            last = self.ladder[-1]
+            order = min(order, self.claimed or order)
+            error = last.error * (last.steps / steps) ** order
+        return Trial(steps, error, solution.number)
 
 
-class Solution(NamedTuple):
-    """What a solve saved, on the host."""
+class Choice(NamedTuple):
+    """The cheapest number of steps found that reaches the tolerance."""
 
-    number: int  # of steps that was asked for
-    steps: int  # that were taken
-    ts: np.ndarray  # all times
-    leaves: list[np.ndarray]  # values, and times
-    finite: bool
-    order: int | None  # of the scheme, if that is known
-
-    @classmethod
-    def of(cls, number: int, solve: Callable[[Array], Any], step) -> "Solution":
-        try:
-            with _quiet():
-                sol = jax.device_get(solve(step))
-        except (RuntimeError, ValueError) as error:
-            # As `diffeqsolve` raises if a solve fails, by the name of its type or, from
-            # inside of `jax.jit`, in the text of another.
-            if "EquinoxRuntimeError" not in f"{type(error).__name__} {error}":
-                raise
-            return cls(number, number, np.zeros(0), [], False, None)
-        if not isinstance(sol, dfx.Solution):
-            raise ValueError(
-                "The solve must return a `diffrax.Solution`, the result of "
-                f"`diffeqsolve`, but returned {type(sol).__name__}."
-            )
-        if np.ndim(sol.stats["num_steps"]):
-            raise ValueError(
-                "The solve must be of one problem, but it is a batch. Choose the step "
-                "for its most difficult member."
-            )
-        times = [np.asarray(t) for t in jax.tree.leaves(sol.ts)]
-        if not times:
-            raise ValueError(
-                "The solve must save at some times, for example by `SaveAt(t1=True)`, "
-                "to find its error."
-            )
-        values = [np.asarray(y) for y in jax.tree.leaves(sol.ys)]
-        good = (dfx.RESULTS.successful, dfx.RESULTS.event_occurred)
-        finite = any(bool(sol.result == x) for x in good)
-        if finite and not all(np.all(np.isfinite(t)) for t in times):
-            raise ValueError(
-                "The solve must save at times that do not depend on the step. Write "
-                "`SaveAt(t1=True)` or `SaveAt(ts=ts)`; with an event, the first."
-            )
-        finite = finite and all(np.all(np.isfinite(y)) for y in values)
-        order = sol.stats.get("order")
-        return cls(
-            number,
-            int(sol.stats["num_steps"]),
-            np.concatenate([np.ravel(t) for t in times]),
-            [*values, *times],
-            finite,
-            None if order is None else int(order),
-        )
+    best: Trial
+    order: float
+    claimed: int | None
+    smooth: bool  # whether errors follow the law of convergence
+    grid: Grid
 
 
 def find_steps(
     solve: Callable[[int], Solution],
+    times: tuple[float, float],
     tolerances: tuple[float, float],
-    grid: int | None,
     max_steps: int,
-) -> tuple[Trial, "Convergence"]:
-    """The smallest number of steps found that reaches the tolerance, and its error."""
-    convergence = Convergence(tolerances, max_steps)
-    for n in _numbers(1 if grid is None else grid):
-        if n > max_steps:
-            raise RuntimeError(convergence.exceeds())
-        if convergence.add(solve(n)):
-            break
-    return _smallest(convergence, solve, grid), convergence
+    report: Callable[[Trial], None],
+) -> Choice:
+    law = grid = doubted = None
+    numbers = doubling(4)
+    while (n := next(numbers)) <= max_steps:
+        finest, last = solve(n), law and law.finest
+        if grid is None and finest.finite:
+            # Of a solve that fails, the saved times are not known.
+            grid = Grid.of(finest.ts, *times)
+            numbers = _numbers(grid.intervals or 1, n)
+        if law is None or last is None:
+            law = Law((), finest, finest.order, tolerances)
+            continue
+        if last.finite and last.steps == finest.steps:
+            if 1 < finest.steps < n:
+                raise ValueError(
+                    f"The solve does not use `dt0`: it takes {finest.steps} steps also "
+                    f"where `dt0` is that of {n}. Write `solve = lambda dt0: "
+                    "diffeqsolve(..., dt0=dt0, ...)`, with steps of constant size."
+                )
+            continue  # Steps between given times may be the same.
+        law = law.add(finest)
+        high = law.trial(last)
+        report(high)
+        converges = len(law.ladder) > 1 and (law.converges or law.agrees)
+        if grid and high.error <= 1 and (converges or doubted):
 
-
-def scaled_error(
-    leaves: list[np.ndarray], exact: list[np.ndarray], rtol: float, atol: float
-) -> float:
-    """The largest error of an entry, over the tolerance."""
-    worst = 0.0
-    for y, z in zip(leaves, exact, strict=True):
-        z = np.asarray(z, float)
-        error = np.abs(np.asarray(y, float) - z)
-        scale = atol + rtol * np.abs(z)
-        # Where both vanish, as for a coordinate at rest, there is no error.
-        scaled = np.divide(
-            *(error, scale), out=np.where(error > 0, np.inf, 0.0), where=scale > 0
-        )
-        worst = max(worst, float(np.max(scaled, initial=0)))
-    return worst
-
-
-class Convergence:
-    """The differences of solves with more and more steps, and what follows from them.
-
-    Of the solutions only the last is kept.
-    """
-
-    def __init__(self, tolerances: tuple[float, float], max_steps: int):
-        self.max_steps, self.tolerances = max_steps, tolerances
-        self.trials: list[Trial] = []
-        self.order, self.claimed = math.nan, None
-        self.finest: Solution | None = None
-        self._difference = math.inf
-        self._least, self._regular, self._stalls = math.inf, False, 0
-        self._at = 0
-
-    @property
-    def _least_order(self) -> float:
-        return 0.75 if self.claimed is None else max(self.claimed / 2, 0.75)
-
-    @property
-    def highest_order(self) -> float:
-        return 20 if self.claimed is None else 2 * self.claimed + 1
-
-    def add(self, solution: Solution) -> bool:
-        """Whether the tolerance is reached, by the last solution but one."""
-        coarse = self.finest
-        if coarse is not None and coarse.steps == solution.steps and coarse.finite:
-            return False  # Steps between given times may be the same.
-        self.finest, self.claimed = solution, solution.order or self.claimed
-        if coarse is None:
-            return False
-        last, self._difference = self._difference, self._distance(coarse, solution)
-        before, self.order = self.order, math.nan
-        if self.trials and 0 < self._difference and last < math.inf:
-            ratio = coarse.steps / self.trials[-1].steps
-            self.order = math.log(last / self._difference) / math.log(ratio)
-        error = self.correct(coarse.steps, self._difference)
-        self.trials.append(Trial(coarse.steps, error, coarse.number))
-        # An order far above the claim is that of leaving an unstable step behind.
-        regular = self._least_order <= self.order <= self.highest_order
-        slow = self.order >= 0.75 and before >= 0.75
-        # Differences of three solves below the tolerance: of rounding, or exact.
-        agree = max(last, self._difference) <= 0.5
-        if error <= 1 and (regular or slow or agree):
-            if agree and not (regular or slow):
-                self.order = math.nan
-            return True
-        both = before, self.order
-        if min(both) >= self._least_order and abs(before / self.order - 1) < 0.25:
-            self._check_affordable(coarse.steps, error)
-        self._check_rounding(regular or slow, coarse, solution)
-        return False
-
-    def measure(self, solution: Solution) -> Trial:
-        """The error of another solution, over the tolerance."""
-        error = self.correct(solution.steps, self._distance(solution, self.finest))
-        self.trials.append(Trial(solution.steps, error, solution.number))
-        return self.trials[-1]
-
-    def correct(self, steps: int, difference: float) -> float:
-        """The error, from the difference to the finest solution."""
-        assert self.finest is not None
-        known = 0.75 <= self.order < math.inf
-        order = self.order if known else (self.claimed or 2)
-        left = 1 - (steps / self.finest.steps) ** order
-        return difference / left if left > 0 else difference
-
-    def exceeds(self, needed: str = "more") -> str:
-        """The error message where more steps than `max_steps` are needed."""
-        if len(self.trials) < 2:
-            return (
-                f"`choose_step(max_steps={self.max_steps})` is too few steps to find "
-                "an error: at least three solves are needed."
-            )
-        steps, error, _ = self.trials[-1]
-        claimed = "" if self.claimed is None else f", that of the scheme {self.claimed}"
-        found = (
-            f"with {steps} steps the error is {error:.1e} times the tolerance, and the "
-            f"measured order {self.order:.1f}{claimed}"
-        )
-        if not error < math.inf:
-            what, found = "found no finite solution", f"up to {self.max_steps} steps"
-            advice = (
-                "Check that the solution exists up to `t1`, that the force is finite "
-                "along it, and that the solve allows as many steps "
-                "(`diffeqsolve(..., max_steps=None)`)."
-            )
-        elif not self.order >= self._least_order:
-            what = f"found no regular convergence with up to {self.max_steps} steps"
-            advice = (
-                "Check that the motion is not chaotic, and that the force is smooth: "
-                "if it has kinks at known times, write "
-                "`stepsize_controller=StepsBetween(times)`; otherwise use a shorter "
-                "time span or a larger tolerance."
-            )
-        else:
-            what = f"needs {needed} than {self.max_steps} steps (`max_steps`)"
-            advice = (
-                "Use a scheme of higher order, for example `TunedRKN6()`, a larger "
-                "tolerance, or allow more steps: `max_steps=...`."
-            )
-        return f"`choose_step` {what}: {found}. {advice}"
-
-    def _check_affordable(self, steps: int, error: float):
-        needed = steps * error ** (1 / self.order)
-        if needed > 2 * self.max_steps:
-            raise RuntimeError(self.exceeds(f"about {needed:.1e}, more"))
-
-    def _check_rounding(self, converges: bool, coarse: Solution, fine: Solution):
-        """An error if solves have stopped converging."""
-        if not (coarse.finite and fine.finite):
-            return
-        self._regular = self._regular or converges
-        self._stalls = self._stalls + 1 if self.order < 0.5 else 0
-        if self._difference < self._least:
-            self._least, self._at = self._difference, coarse.steps
-        pairs = zip(coarse.leaves, fine.leaves, strict=True)
-        pairs = [x for x in pairs if np.issubdtype(x[1].dtype, np.floating)]
-        precision = max((b.dtype for _, b in pairs), key=lambda x: np.finfo(x).eps)
-        eps, size = (
-            float(np.finfo(precision).eps),
-            lambda x: np.max(np.abs(x), initial=0),
-        )
-        change = max(float(size(a - b) / max(size(b), 1e-300)) for a, b in pairs)
-        rounding = change < 1e3 * eps or (self._regular and change < eps**0.25)
-        if self._stalls >= 2 and rounding:
-            double = "double precision (`jax.config.update('jax_enable_x64', True)`), "
-            # Only the loop of the package tells the order.
-            equal = "`adjoint=FixedStepAdjoint()`, whose steps are all equal, "
-            raise RuntimeError(
-                f"`choose_step` cannot reach this tolerance in {precision}: "
-                f"from {self._at} steps on, solves with more steps differ by rounding, "
-                f"by {self._least:.1e} times the tolerance or more. Use "
-                f"{equal if self.claimed is None else ''}`Compensated(solver)`, "
-                f"{double if precision == np.float32 else ''}or a larger tolerance."
-            )
-
-    def _distance(self, solution: Solution, finest: Solution | None) -> float:
-        assert finest is not None
-        if not (solution.finite and finest.finite):
-            return math.inf
-        return scaled_error(solution.leaves, finest.leaves, *self.tolerances)
-
-
-def _numbers(grid: int) -> Iterator[int]:
-    """Numbers of steps to try, each about twice the last.
-
-    Those above the grid are its multiples by 1, 3, 7, 15, ... No two in succession have
-    a common divisor beyond the grid: otherwise all solves might see the same phase of a
-    force that is periodic in time, and agree on a wrong solution.
-    """
-    numbers = [grid]
-    while numbers[-1] > 10:
-        numbers.append((numbers[-1] - 1) // 2)
-    yield from (n for n in reversed(numbers) if n > 3)
-    yield from (n * grid for n in doubling(3) if n * grid > 3)
-
-
-def doubling(n: int) -> Iterator[int]:
-    """Integers, each about twice the last, without a common divisor."""
-    while True:
-        yield n
-        n = 2 * n + 1
-
-
-def _smallest(
-    convergence: Convergence, solve: Callable[[int], Solution], grid: int | None
-) -> Trial:
-    """A smaller number of steps than the last that reaches the tolerance."""
-    measure = lambda n: convergence.measure(solve(n))
-    *trials, high = convergence.trials
-    low = next((t for t in reversed(trials) if t.error > 1), Trial(0, math.inf, 0))
-    every = lambda low, high: np.arange(low + 1, high)
-    steepest = 1.5 * (convergence.claimed or convergence.highest_order)
-    if grid is None:
-        return _search(every, low, high, measure, steepest)
-    if high.number >= grid:
-        multiples = lambda low, high: grid * np.arange(low // grid + 1, high // grid)
-        return _search(multiples, low, high, measure, steepest)
-    best = _search(every, low, high, measure, steepest)
-    for n in range(best.number, min(2 * best.number, grid) + 1):
-        if grid % n == 0:
-            trial = best if n == best.number else measure(n)
-            if trial.error <= 1:
+            def measure(n: int, law: Law = law) -> Trial:
+                trial = law.trial(law.finest if n == law.finest.number else solve(n))
+                report(trial)
                 return trial
-    return best
+
+            smooth = _is_smooth(law, high, grid, measure)
+            rounding = max(x.error for x in law.ladder[-2:]) < 1e-3
+            rounding = rounding or (law.agrees and not law.exceeds(0.75))
+            order = math.nan if rounding else law.orders[-1]
+            choice = Choice(high, order, law.claimed, smooth, grid)
+            if smooth or doubted:
+                best = _smallest(law, high, grid, measure) if smooth else high
+                more = int(grid.cheaper(np.array([best.number]))[0])
+                if best.number < more <= max_steps:
+                    finer = measure(more)
+                    best = finer if finer.error <= 1 else best
+                return choice._replace(best=best)
+            doubted = choice
+            continue
+        doubted = None
+        if high.error > 1:
+            _check_rounding(law, last)
+            _check_hopeless(law, high, max_steps)
+    if doubted is None:
+        raise RuntimeError(_exceeds(law, max_steps))
+    return doubted
 
 
-def _search(
-    between: Callable[[int, int], np.ndarray],
-    low: Trial,
-    high: Trial,
-    measure: Callable[[int], Trial],
-    steepest: float,
-) -> Trial:
-    """A smaller number of steps than `high` that reaches the tolerance."""
-    failed = False
+def _is_smooth(law: Law, high: Trial, grid: Grid, measure) -> bool:
+    """Whether errors fall by the law also where steps have another phase: where a force
+    jumps inside of a step, they may have fallen by chance."""
+    order = law.orders[-1]
+    if 0.75 <= order < law.least or not (law.agrees or order >= law.least):
+        return False
+    unit = grid.intervals or 1
+    unit = unit if high.number % unit == 0 else 1
+    settled = law.exceeds(0.65 * (law.claimed or 2))
+    factors = (1.5,) if settled else (1.5, 1.25)
+    # Even, since the others are odd: these see one phase in the middle of the span.
+    numbers = (2 * unit * math.ceil(x * high.number / unit / 2) for x in factors)
+    for trial in map(measure, dict.fromkeys(numbers)):
+        expected = 1.3 * high.error * (high.steps / trial.steps) ** law.least
+        if not trial.error <= max(expected, 0.5 if law.agrees else 0.1):
+            return False
+    return True
+
+
+def _smallest(law: Law, high: Trial, grid: Grid, measure) -> Trial:
+    """A smaller number of steps that reaches the tolerance."""
+    too_few = [x for x in law.ladder[:-1] if x.error > 1]
+    low = too_few[-1] if too_few else Trial(0, math.inf, 0)
+    steepest, failed = 1.5 * (law.claimed or 20), False
     for _ in range(6):
-        numbers = between(low.number, high.number)
+        numbers = np.unique(grid.cheaper(np.arange(low.number + 1, high.number)))
+        numbers = numbers[numbers < high.number]
         if high.error >= ENOUGH or not numbers.size:
             break
         # By the law of convergence, between the two on a log scale. Where the larger
@@ -336,8 +210,105 @@ def _search(
         guess = high.number * (error / AIM) ** (1 / slope)
         if failed:  # Not again close to the lower end.
             guess = max(guess, math.sqrt(low.number * high.number))
-        n = int(numbers[np.argmin(np.abs(numbers - guess))])
-        trial = measure(n)
+        trial = measure(int(numbers[np.argmin(np.abs(numbers - guess))]))
         failed = trial.error > 1
         low, high = (trial, high) if failed else (low, trial)
     return high
+
+
+def _check_rounding(law: Law, coarse: Solution):
+    """An error if solves have stopped converging, in the precision of the state."""
+    fine = law.finest
+    if not (coarse.finite and fine.finite and all(x < 0.5 for x in law.orders[-2:])):
+        return
+    pairs = zip(coarse.leaves, fine.leaves, strict=True)
+    pairs = [x for x in pairs if np.issubdtype(x[1].dtype, np.floating)]
+    precision = max((b.dtype for _, b in pairs), key=lambda x: np.finfo(x).eps)
+    size, eps = lambda x: np.max(np.abs(x), initial=0), float(np.finfo(precision).eps)
+    change = max(float(size(a - b) / max(size(b), 1e-300)) for a, b in pairs)
+    settled = 0.65 * (law.claimed or 2)
+    settled = any(law.exceeds(settled, i) for i in range(3, len(law.orders)))
+    if change < 1e3 * eps or (settled and change < eps**0.5):
+        least = min(law.ladder, key=lambda x: x.error)
+        double = "double precision (`jax.config.update('jax_enable_x64', True)`), "
+        # Only the loop of the package tells the order.
+        equal = "`adjoint=FixedStepAdjoint()`, whose steps are all equal, "
+        raise RuntimeError(
+            f"`choose_step` cannot reach this tolerance in {precision}: from "
+            f"{least.steps} steps on, solves with more steps differ by rounding, by "
+            f"{least.error:.1e} times the tolerance or more. Use "
+            f"{equal if law.claimed is None else ''}`Compensated(solver)`, "
+            f"{double if precision == np.float32 else ''}or a larger tolerance."
+        )
+
+
+def _check_hopeless(law: Law, high: Trial, max_steps: int):
+    """An error if by three doublings the tolerance is not within reach."""
+    four = law.ladder[-4:]
+    patience = max(PATIENCE, max_steps // 500)
+    if len(four) < 4 or four[0].steps < patience or not four[0].error < math.inf:
+        return
+    # In favour of solves that begin to converge.
+    order = max(four[0].order(four[-1]), law.orders[-1])
+    needed = high.steps * high.error ** (1 / order) if order > 0.1 else math.inf
+    if needed > 2 * max_steps:
+        raise RuntimeError(_exceeds(law, max_steps, needed))
+
+
+def _exceeds(law: Law | None, max_steps: int, needed: float = math.inf) -> str:
+    """The error message where more steps than `max_steps` are needed."""
+    if law is None or len(law.ladder) < 2:
+        return (
+            f"`choose_step(max_steps={max_steps})` is too few steps to find an error: "
+            "at least three solves with different numbers of steps are needed."
+        )
+    last, order, tried = law.ladder[-1], law.orders[-1], law.finest.steps
+    claimed = "" if law.claimed is None else f", that of the scheme {law.claimed}"
+    found = (
+        f"with {last.steps} steps the error is {last.error:.1e} times the tolerance, "
+        f"and the measured order {order:.1f}{claimed}"
+    )
+    if not last.error < math.inf:
+        what, found = "found no finite solution", f"with up to {tried} steps"
+        advice = (
+            "Check that the solution exists up to `t1`, that the force is finite along "
+            "it, and that the solve allows as many steps (`max_steps=None`)."
+        )
+    elif not order >= law.least - 0.4:
+        what = f"found no regular convergence with up to {tried} steps"
+        advice = (
+            "Check that the motion is not chaotic, and that the force is smooth: if it "
+            "has kinks or jumps at known times, write "
+            "`stepsize_controller=StepsBetween(times)`; otherwise use a shorter time "
+            "span, a larger tolerance or, for many fast periods, a larger `max_steps`."
+        )
+    else:
+        about = f"about {needed:.1e}, more" if needed < math.inf else "more"
+        what = f"needs {about} than {max_steps} steps (`max_steps`)"
+        advice = (
+            "Use a scheme of higher order, for example `TunedRKN6()`, a larger "
+            "tolerance, or allow more steps: `max_steps=...`."
+        )
+    return f"`choose_step` {what}: {found}. {advice}"
+
+
+def _numbers(grid: int, after: int) -> Iterator[int]:
+    """Numbers of steps to try after one, each about twice the last.
+
+    Those above the grid are its multiples by 1, 3, 7, 15, ... No two in succession have
+    a common divisor beyond the grid: otherwise all solves might see the same phase of a
+    force that is periodic in time, and agree on a wrong solution.
+    """
+    numbers = [grid]
+    while numbers[-1] > 10:
+        numbers.append((numbers[-1] - 1) // 2)
+    more = (n * grid for n in doubling(3))
+    chain = itertools.chain(reversed(numbers), more)
+    yield from (n for n in chain if n > 1.5 * after)
+
+
+def doubling(n: int) -> Iterator[int]:
+    """Integers, each about twice the last, without a common divisor."""
+    while True:
+        yield n
+        n = 2 * n + 1

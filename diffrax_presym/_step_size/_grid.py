@@ -1,4 +1,42 @@
+"""The saved times as a grid, and what it costs to reach them."""
+
+from typing import NamedTuple
+
 import numpy as np
+
+
+class Grid(NamedTuple):
+    """Saved times, in equal intervals of the span."""
+
+    intervals: int | None  # `None` if the times are irregular
+    at: np.ndarray  # the interval at whose end each time lies
+
+    @classmethod
+    def of(cls, ts: np.ndarray, t0: float, t1: float) -> "Grid":
+        if not np.all(np.abs(ts - t0) <= abs(t1 - t0) * (1 + 1e-6)):
+            raise ValueError(
+                f"`choose_step(solve, t0, t1)` needs the times of the solve, but got "
+                f"{t0} and {t1}, and the solve saves at times up to "
+                f"{np.max(np.abs(ts - t0)):.6g} from `t0`."
+            )
+        number, where = intervals(ts, t0, t1), (np.asarray(ts, float) - t0) / (t1 - t0)
+        return cls(number, np.round(where * (number or 1)).astype(int))
+
+    def cost(self, steps: np.ndarray) -> np.ndarray:
+        """Of a solve, in steps: a time inside of a step takes a shorter one."""
+        if self.intervals is None:
+            return steps + len(self.at)
+        # A time is the end of a step if it is so with the steps that divide the grid.
+        common, which = np.unique(np.gcd(steps, self.intervals), return_inverse=True)
+        inside = [np.count_nonzero(self.at * k % self.intervals) for k in common]
+        return steps + np.asarray(inside, int)[which]
+
+    def cheaper(self, steps: np.ndarray) -> np.ndarray:
+        """As many steps, or more that end at all times and cost no more."""
+        if self.intervals is None:
+            return steps
+        multiple = -(-steps // self.intervals) * self.intervals
+        return np.where(multiple <= self.cost(steps), multiple, steps)
 
 
 def intervals(ts: np.ndarray, t0: float, t1: float) -> int | None:

@@ -7,8 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from .._step_size._choose import check_times
-from .._step_size._convergence import scaled_error, Solution
+from .._step_size._solution import check_times, scaled_error, Solution
 from .._system._base import AbstractSystem
 from ._energy import energy, energy_error
 from ._work_precision import Solve, WorkPrecision

@@ -9,8 +9,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from .._step_size._choose import check_times, check_tolerance
-from .._step_size._convergence import scaled_error, Solution
+from .._step_size._solution import (
+    check_times,
+    check_tolerance,
+    scaled_error,
+    Solution,
+)
 
 
 Solve = Callable[[Any], Any]

@@ -1,0 +1,130 @@
+"""What a solve saved, and how far it is from another."""
+
+import logging
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import jax
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array
+
+
+class Solution(NamedTuple):
+    """What a solve saved, on the host."""
+
+    number: int  # of steps that was asked for
+    steps: int  # that were taken
+    ts: np.ndarray  # all times
+    leaves: list[np.ndarray]  # values, and times
+    finite: bool
+    order: int | None  # of the scheme, if that is known
+
+    @classmethod
+    def of(cls, number: int, solve: Callable[[Array], Any], step) -> "Solution":
+        # JAX logs a traceback where a solve fails, as a trial may.
+        logger = logging.getLogger("jax._src.callback")
+        disabled, logger.disabled = logger.disabled, True
+        try:
+            sol = solve(step)
+            check_concrete(sol, "The solve")
+            sol = jax.device_get(sol)
+        except (RuntimeError, ValueError) as error:
+            # As `diffeqsolve` raises if a solve fails, by the name of its type or, from
+            # inside of `jax.jit`, in the text of another.
+            text = f"{type(error).__name__} {error}"
+            if "(t1 - t0) * dt0 >= 0" in text:
+                raise ValueError(
+                    "The solve runs in the other direction of time. `t0` and `t1` must "
+                    "be those that it passes to `diffeqsolve`, in this order."
+                ) from None
+            if "EquinoxRuntimeError" not in text:
+                raise
+            return cls(number, number, np.zeros(0), [], False, None)
+        finally:
+            logger.disabled = disabled
+        if not isinstance(sol, dfx.Solution):
+            raise ValueError(
+                "The solve must return a `diffrax.Solution`, the result of "
+                f"`diffeqsolve`, but returned {type(sol).__name__}."
+            )
+        if np.ndim(sol.stats["num_steps"]):
+            raise ValueError(
+                "The solve must be of one problem, but it is a batch. Choose the step "
+                "for its most difficult member."
+            )
+        times = [np.asarray(t) for t in jax.tree.leaves(sol.ts)]
+        if not times:
+            raise ValueError(
+                "The solve must save at some times, for example by `SaveAt(t1=True)`, "
+                "to find its error."
+            )
+        values = [np.asarray(y) for y in jax.tree.leaves(sol.ys)]
+        good = (dfx.RESULTS.successful, dfx.RESULTS.event_occurred)
+        finite = any(bool(sol.result == x) for x in good)
+        if finite and not all(np.all(np.isfinite(t)) for t in times):
+            raise ValueError(
+                "The solve must save at times that do not depend on the step. Write "
+                "`SaveAt(t1=True)` or `SaveAt(ts=ts)`; with an event, the first."
+            )
+        finite = finite and all(np.all(np.isfinite(y)) for y in values)
+        order = sol.stats.get("order")
+        return cls(
+            number,
+            int(sol.stats["num_steps"]),
+            np.concatenate([np.ravel(t) for t in times]),
+            [*values, *times],
+            finite,
+            None if order is None else int(order),
+        )
+
+
+def scaled_error(
+    leaves: list[np.ndarray], exact: list[np.ndarray], rtol: float, atol: float
+) -> float:
+    """The largest error of an entry, over the tolerance."""
+    worst = 0.0
+    for y, z in zip(leaves, exact, strict=True):
+        z = np.asarray(z, np.result_type(z, float))
+        error = np.abs(np.asarray(y, z.dtype) - z)
+        scale = atol + rtol * np.abs(z)
+        # Where both vanish, as for a coordinate at rest, there is no error.
+        scaled = np.divide(
+            *(error, scale), out=np.where(error > 0, np.inf, 0.0), where=scale > 0
+        )
+        worst = max(worst, float(np.max(scaled, initial=0)))
+    return worst
+
+
+def check_concrete(x, name: str):
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(x)):
+        raise ValueError(
+            f"{name} needs concrete numbers, but got traced ones: a step is chosen by "
+            "solving several times. Do so outside of `jax.jit`, `jax.grad` and "
+            "`jax.vmap`, and pass the result to the transformed function."
+        )
+
+
+def check_times(t0, t1, name: str) -> tuple[float, float]:
+    check_concrete((t0, t1), f"`{name}`")
+    if np.shape(t0) or np.shape(t1) or not np.isfinite(t1 - t0) or t0 == t1:
+        raise ValueError(
+            f"`{name}` needs two different finite times `t0` and `t1`, but got "
+            f"{t0} and {t1}."
+        )
+    return float(t0), float(t1)
+
+
+def check_tolerance(x, name: str) -> float:
+    check_concrete(x, f"`{name}`")
+    try:
+        value = float(x)
+    except (TypeError, ValueError):
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise ValueError(
+            f"`{name}` must be a number that is not negative, but got {x!r}."
+        )
+    return value
