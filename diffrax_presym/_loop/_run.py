@@ -6,6 +6,7 @@ one to the next without asking. Between steps the solution is a shorter step of 
 scheme, of its full order.
 """
 
+import math
 from collections.abc import Callable
 from functools import partial, reduce
 from typing import Any
@@ -29,6 +30,7 @@ from .._scheme._base import (
     Scheme,
 )
 from .._scheme._engine import cheap_iterations, prepare_once
+from .._scheme._failure import explain, unless_too_strong
 from .._system._bound import System
 from ._steps import Rows, Steps
 
@@ -85,7 +87,9 @@ class Problem(eqx.Module):
         if not self.prepared_once:
             return None
         span = self.steps.span(system, jnp.asarray(0))
-        return prepare_once(self.scheme.moves, system, span, backward)
+        data = prepare_once(self.scheme.moves, system, span, backward)
+        most = math.inf if backward else self.scheme.most_friction
+        return unless_too_strong(most, system, span, data)
 
     def between(
         self,
@@ -225,6 +229,11 @@ def run(problem: Problem, keep: Array | None = None):
     result = success if progress.result is None else progress.result
     bad = (result == success) & ~finite
     result = dfx.RESULTS.where(bad, NONFINITE, result)
+    system, steps, n = problem.system, problem.steps, progress.n
+    time = lambda i: system.time(steps.time(i))
+    ends = (time(0 * n), problem.start), (time(n), progress.point)
+    spans = lambda i: steps.span(system, i)
+    result = explain(problem.scheme, system, spans, n, ends, result)
     short = (result == success) & (progress.n < problem.steps.total)
     result = dfx.RESULTS.where(short, dfx.RESULTS.max_steps_reached, result)
     trace = Trace(progress.n, progress.point, starts, kept)

@@ -9,6 +9,7 @@ from ._base import AbstractPresymplecticSolver, Scheme
 from ._engine import inverse, Stages
 from ._moves import FrozenDrift, Kick
 from ._splitting import find_split, first_force
+from ._strong_friction import part_of, Pattern
 
 
 def _momentum_first(solver, system: System, known: bool = False) -> Stages:
@@ -21,6 +22,10 @@ def _momentum_first(solver, system: System, known: bool = False) -> Stages:
     find_split(solver, "separable", system)
     kick = Kick("separable", 1, known)
     return Stages([kick, FrozenDrift()], [(0, 0, 1), (0, 1, 1)])
+
+
+_EULER: Pattern = (("kick", 1.0, 0), ("move", 1.0, 0), ("decay", 1.0, 0))
+_HALF = part_of(_EULER, 0.5)
 
 
 def _check(first: Any) -> Any:
@@ -70,7 +75,9 @@ class PresymplecticEuler(AbstractPresymplecticSolver):
 
     def scheme(self, system: System) -> Scheme:
         moves = _momentum_first(self, system)
-        return Scheme(moves if self.first == "momentum" else inverse(moves))
+        if self.first == "momentum":
+            return Scheme(moves, pattern=_EULER)
+        return Scheme(inverse(moves), pattern=_EULER[::-1])
 
 
 PresymplecticEuler.__init__.__doc__ = _ARGUMENTS
@@ -119,11 +126,17 @@ class PresymplecticLeapfrog(AbstractPresymplecticSolver):
             A = _momentum_first(self, system, known=True)
             moves = Stages([A, inverse(A)], [(0, 0.5, 0.5), (0.5, 1, 0.5)])
             start = lambda system, t, y: first_force(system, "separable", t, y)
-            return Scheme(moves, start=start, end_force=lambda carry: carry)
+            return Scheme(
+                moves,
+                start=start,
+                end_force=lambda carry: carry,
+                pattern=_HALF + _HALF[::-1],
+            )
         # Two kicks at the same position are merged.
         kick, drift = _momentum_first(self, system).moves
         table = [(0, 0.5, 0.5), (0.5, 0.5, 1), (0.5, 1, 0.5)]
-        return Scheme(Stages([inverse(drift), kick, drift], table))
+        moves = Stages([inverse(drift), kick, drift], table)
+        return Scheme(moves, pattern=_HALF[::-1] + _HALF)
 
 
 PresymplecticLeapfrog.__init__.__doc__ = _ARGUMENTS
