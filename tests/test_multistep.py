@@ -349,7 +349,7 @@ def test_instability_is_reported(order, limit, adjoint):
         return solve(term, solver, 0.0, n, 1.0, y0, **options)
 
     for omega in (0.0, limit - 0.01):
-        sol = run(omega)
+        sol: Any = run(omega)
         assert sol.result == dfx.RESULTS.successful
         assert abs(float(sol.ys[0][-1, 0]) - np.cos(omega * 400)) < 0.03
     for omega in (limit + 0.02, 0.8, 1.5):
@@ -370,6 +370,14 @@ def test_the_history_of_another_solution(adjoint):
     assert_close(rest.ys, exact, 1e-8)
     rest = solve(term, solver, 2.0, 4.0, 0.1, (y[0], y[1] + 1e-3), ONE, **options)
     assert rest.result == OTHER_HISTORY
+
+
+def test_a_force_that_passes_through_zero():
+    """In Diffrax's loop each step is checked, at long steps that are stable."""
+    rate, y0 = dps.ConstantDamping(0.1), (jnp.ones(1), jnp.zeros(1))
+    term = dps.MechanicalSystem(dps.QuadraticKinetic(), pendulum, rate)
+    ys = ends(term, dps.SymmetricMultistep(), 0.0, 100.0, 0.5, y0)
+    assert_close(ys, ends(term, EXACT, 0.0, 100.0, 0.1, y0), 1e-3)
 
 
 def test_most_friction():

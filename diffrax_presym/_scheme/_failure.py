@@ -47,11 +47,13 @@ def explain(
     because friction was too strong; or the failure of a scheme to take its ends."""
     first, most = jnp.zeros_like(n), scheme.most_friction
     if _is_too_strong(most, system, span(first)) is not None:
-        good = lambda i: ~jnp.asarray(_is_too_strong(most, system, span(i)))
-        # Only a solve that failed looks for the step.
+        bad = lambda i: jnp.asarray(_is_too_strong(most, system, span(i)))
         failed = result == NONFINITE
-        more = lambda i: failed & (i < n) & good(i)
-        found = failed & (lax.while_loop(more, lambda i: i + 1, first) < n)
+        if isinstance(n, int) and n == 1:
+            found = failed & bad(first)
+        else:  # Only a solve that failed looks for the step.
+            more = lambda i: failed & (i < n) & ~bad(i)
+            found = failed & (lax.while_loop(more, lambda i: i + 1, first) < n)
         result = dfx.RESULTS.where(found, FRICTION_TOO_STRONG, result)
     if scheme.check is not None:
         for t, point in ends:

@@ -114,7 +114,8 @@ class PresymplecticTao(AbstractPresymplecticSolver):
 
     The scheme of the paper for nonseparable Hamiltonians.
     [`diffrax_presym.PresymplecticGauss`][] is faster to almost any error, preserves the
-    structure in the phase space itself, and has no coupling to choose.
+    structure in the phase space itself, and has no coupling to choose. A step of more
+    friction than 3.2, the rate times its length, makes a solve fail.
 
     ??? cite "Reference"
 
