@@ -162,17 +162,16 @@ def slow_motion(quick):
                 exact = (fast * grow - slow * decay) / (fast - slow), grow - decay
                 exact = exact[0].real, (slow * fast / (fast - slow) * exact[1]).real
                 good = successful(sol)
-                cells += [a[0] / b - 1 if good else np.inf for a, b in zip(y, exact)]
+                pairs = zip(y, exact, strict=True)
+                cells += [a[0] / b - 1 if good else np.inf for a, b in pairs]
             rows.append(cells)
         np.testing.assert_allclose(rows[0], rows[-1], rtol=0.05, atol=1e-11)
-        # Without digits, as a number that is not right.
         table.row(name, *rows[0])
 
 
 def strong_friction(quick):
     """From which friction a solution grows, by the eigenvalues of a step, and from
-    which a solve fails, as a stage that goes back in time amplifies rounding errors
-    beyond half of the digits."""
+    which a solve fails, as it is more than the scheme resolves."""
     parts = "stable to", "error", "fails"
     table = Table(
         "   strong friction of q'' = -q - gamma q': the largest h gamma at which no "

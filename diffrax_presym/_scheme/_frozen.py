@@ -48,7 +48,7 @@ separable.
 
 
 class PresymplecticEuler(AbstractPresymplecticSolver):
-    """Presymplectic Euler's method.
+    r"""Presymplectic Euler's method.
 
     1st order. One force evaluation per step. Uses 3rd order Hermite interpolation for
     dense/ts output.
@@ -57,9 +57,9 @@ class PresymplecticEuler(AbstractPresymplecticSolver):
     implicit. The cheapest scheme. Not symmetric: the two variants are adjoint to each
     other. [`diffrax_presym.PresymplecticLeapfrog`][] has second order at the same cost;
     use Euler only where this map itself is wanted, for example as an optimiser. Under
-    strong friction, $x = h \gamma$, the slow motion is $x / (1 - e^{-x})$ times too fast,
-    and the momentum $x / (e^x - 1)$ times what it should be; with `first="position"` the
-    two factors are exchanged.
+    strong friction, $x = h \gamma$, the slow motion is $x / (1 - e^{-x})$ times too
+    fast, and the momentum $x / (e^x - 1)$ times what it should be; with
+    `first="position"` the two factors are exchanged.
 
     Equations (presymp_euler) and (presymp_euler2) of França, Jordan
     and Vidal (2021).
