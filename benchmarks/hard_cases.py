@@ -118,12 +118,60 @@ def stability(quick):
             energy = np.sum(p**2 + (np.asarray(omega) * q) ** 2) / 5
         table.row(str(factor), energy - 1, "" if successful(sol) else "reported")
     strong_friction(quick)
+    slow_motion(quick)
+
+
+def slow_motion(quick):
+    """Errors of position and momentum of an oscillator with h omega = 0.3, relative to
+    the exact values, at the time in which friction lets the slow motion fall by 1 / e,
+    20 steps or more; in two loops, whose results are the same."""
+    products = (0.1, 1.0, 10.0, 100.0)
+    table = Table(
+        "   strong friction: errors of q and p for each h gamma, h omega = 0.3",
+        "scheme:<38",
+        *(f"{x:g}, {part}:>8.0e" for x in products for part in "qp"),
+    )
+    strang = dps.Strang()
+    solvers: dict[str, Any] = {name: x.solver for name, x in SCHEMES.items()}
+    solvers |= {
+        "SuzukiYoshida(4, Strang)": dps.SuzukiYoshida(4, strang),
+        "SofroniouSpaletta(6, Strang)": dps.SofroniouSpaletta(6, strang),
+        "Compensated(TunedRKN6)": dps.Compensated(dps.TunedRKN6()),
+        "PresymplecticGauss(4)": dps.PresymplecticGauss(4),
+        "PresymplecticGauss(4, Newton)": dps.PresymplecticGauss(
+            4, optx.Newton(1e-12, 1e-12)
+        ),
+    }
+    loops = dps.FixedStepAdjoint(), dfx.ForwardMode()
+    for name, solver in solvers.items():
+        rows = []
+        for adjoint in loops[: 1 if quick else 2]:
+            cells = []
+            for x in products:
+                system = mechanics(
+                    dps.QuadraticPotential(0.09), dps.ConstantDamping(jnp.asarray(x))
+                )
+                # Two rates; the smaller one without cancellation.
+                root = (x * x / 4 - 0.09 + 0j) ** 0.5
+                fast = -x / 2 - root
+                slow = 0.09 / fast
+                t = float(max(20, np.ceil(x / 0.09)))
+                y0 = (jnp.ones(1), jnp.zeros(1))
+                sol, y = end(system, solver, 0.0, t, 1.0, y0, adjoint=adjoint)
+                grow, decay = np.exp(slow * t), np.exp(fast * t)
+                exact = (fast * grow - slow * decay) / (fast - slow), grow - decay
+                exact = exact[0].real, (slow * fast / (fast - slow) * exact[1]).real
+                good = successful(sol)
+                pairs = zip(y, exact, strict=True)
+                cells += [a[0] / b - 1 if good else np.inf for a, b in pairs]
+            rows.append(cells)
+        np.testing.assert_allclose(rows[0], rows[-1], rtol=0.05, atol=1e-11)
+        table.row(name, *rows[0])
 
 
 def strong_friction(quick):
     """From which friction a solution grows, by the eigenvalues of a step, and from
-    which a solve fails, as a stage that goes back in time amplifies rounding errors
-    beyond half of the digits."""
+    which a solve fails, as it is more than the scheme resolves."""
     parts = "stable to", "error", "fails"
     table = Table(
         "   strong friction of q'' = -q - gamma q': the largest h gamma at which no "

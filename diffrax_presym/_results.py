@@ -38,6 +38,18 @@ NOT_CONVERGED = _entry(
     "atol))`. With `throw=False` the last time saved by `SaveAt(t1=True)` is that at "
     "which the step started.",
 )
+MULTISTEP_UNSTABLE = _entry(
+    "multistep_unstable",
+    "`SymmetricMultistep` is unstable: the step times the highest frequency of the "
+    "system is more than 0.63 (order 8) or 0.48 (order 10). "
+    "Take shorter steps, or use `TunedRKN6()`.",
+)
+OTHER_HISTORY = _entry(
+    "other_history",
+    "The `solver_state` is the history of another solution: its momentum is not that "
+    "of `y0`. Pass the `solver_state` of the solve whose final state is `y0`, or pass "
+    "`made_jump=True`, or omit it.",
+)
 STEP_DENSITY_MISSED = _entry(
     "step_density_missed",
     "A step differs from `epsilon` times the step density at one of its ends by more "

@@ -10,11 +10,13 @@ import pytest
 from helpers import assert_close, harmonic, solve, substeps, trajectory
 
 import diffrax_presym as dps
+from diffrax_presym._results import FRICTION_TOO_STRONG
 
 
 LEAPFROG = dps.PresymplecticLeapfrog()
 RKN4 = dps.BlanesMoanRKN4()
 REST = (jnp.ones(1), jnp.zeros(1))
+FIXED = dps.FixedStepAdjoint()
 NONFINITE: Any = dfx.RESULTS.nonfinite  # pyright: ignore[reportAttributeAccessIssue]
 
 
@@ -92,8 +94,93 @@ def test_singular_damping_from_its_start(solver, t0):
 def test_stages_before_the_start_are_reported():
     system = damped(harmonic, dps.LogDamping(3.0))
     run = lambda solver: solve(system, solver, 1e-6, 1.0, 0.01, REST, throw=False)
-    assert run(dps.SuzukiYoshida(4)).result == NONFINITE
+    assert run(dps.SuzukiYoshida(4)).result != dfx.RESULTS.successful
     assert run(dps.Suzuki4()).result == dfx.RESULTS.successful
+
+
+def slow_motion(solver, h_gamma, adjoint=FIXED, friction=dps.ConstantDamping, h=1.0):
+    """The errors of q and p of an oscillator that friction slows down, of step times
+    frequency 0.3, after a time in which the motion falls by 1 / e; and the result."""
+    gamma, omega = h_gamma / h, 0.3 / h
+    rate = -(omega**2) / (gamma / 2 + (gamma**2 / 4 - omega**2) ** 0.5)
+    spring = dps.QuadraticPotential(jnp.asarray(omega**2))
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), spring, friction(gamma))
+    t1, y0 = h * np.ceil(1 / abs(rate * h)), (jnp.ones(1), jnp.ones(1) * rate)
+    args = system, solver, 0.0, t1, h, y0
+    sol: Any = solve(*args, adjoint=adjoint, throw=False, max_steps=4096)
+    q, p = last(sol)
+    exact = np.exp(rate * t1)
+    return abs(q[0] / exact - 1), abs(p[0] / (rate * exact) - 1), sol.result
+
+
+# Below and above the most friction that they resolve.
+STRONG = [
+    (dps.SuzukiYoshida(4), 1.0, 1.3),
+    (dps.SuzukiYoshida(4, dps.Strang()), 2.0, 3.0),
+    (dps.Suzuki4(), 3.0, 3.3),
+    (dps.SofroniouSpaletta(6), 6.0, 6.5),
+    (dps.SofroniouSpaletta(10), 12.0, 13.0),
+    (dps.BlanesMoan4(), 17.5, 40.0),
+    (dps.BlanesMoanRKN4(), 9.9, 20.0),
+    (dps.BlanesMoan6(), 14.0, 16.0),
+    (dps.TunedRKN6(), 29.0, 50.0),
+    (dps.Compensated(dps.TunedRKN6()), 29.0, 50.0),
+    (dps.Composition(dps.TunedRKN6(), (0.25,) * 4), 117.0, 200.0),
+    (dps.BlanesCasasRKN8(), 25.0, 50.0),
+    (dps.TunedLinear8(), 9.5, 30.0),
+    (dps.SymmetricMultistep(8), 1.06, 2.0),
+]
+
+
+@pytest.mark.parametrize("adjoint", [FIXED, dfx.RecursiveCheckpointAdjoint()])
+@pytest.mark.parametrize("solver, below, above", STRONG)
+def test_strong_friction(solver, below, above, adjoint):
+    q, p, result = slow_motion(solver, below, adjoint)
+    assert q < 0.12 and p < 0.12 and result == dfx.RESULTS.successful
+    q, p, result = slow_motion(solver, above, adjoint)
+    assert np.isnan(q) and np.isnan(p) and result == FRICTION_TOO_STRONG
+
+
+@pytest.mark.parametrize("h_gamma", [0.5, 5.0, 100.0])
+def test_momentum_of_coarse_schemes_under_strong_friction(h_gamma):
+    """After the last half of a kick it is (x / 2) coth(x / 2) times what a constant
+    force leaves."""
+    x = h_gamma / 2
+    force = dps.ForceField(lambda t, q, args: jnp.ones(1))
+    system = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), force, dps.ConstantDamping(h_gamma)
+    )
+    for solver, factor in ((dps.Strang(), 1.0), (LEAPFROG, x / np.tanh(x))):
+        options: dict = dict(saveat=dfx.SaveAt(steps=True), adjoint=FIXED)
+        sol: Any = solve(system, solver, 0.0, 100.0, 1.0, REST, **options)
+        q, p = sol.ys
+        assert_close(p[99] * h_gamma, jnp.ones(1) * x / np.tanh(x), 1e-12)
+        assert_close((q[99] - q[98]) * h_gamma, jnp.ones(1) * factor, 1e-10)
+
+
+def test_friction_that_becomes_too_strong():
+    """Only the steps in which it is are beyond a scheme: in them the solve fails."""
+    system = damped(harmonic, lambda t: jnp.maximum(t - 5.0, 0.0) ** 2 * 20)
+    for adjoint in (FIXED, dfx.RecursiveCheckpointAdjoint()):
+        run = lambda t1, adjoint=adjoint: solve(
+            *(system, dps.BlanesMoan4(), 0.0, t1, 0.5, REST),
+            adjoint=adjoint,
+            throw=False,
+        )
+        assert run(5.5).result == dfx.RESULTS.successful
+        assert run(8.0).result == FRICTION_TOO_STRONG
+
+
+def test_half_solver_rejects_steps_of_too_much_friction():
+    system = damped(harmonic, dps.ConstantDamping(100.0))
+    control = dfx.PIDController(rtol=1e-6, atol=1e-6)
+    solver = dfx.HalfSolver(dps.TunedRKN6())
+    options: dict = dict(stepsize_controller=control)
+    sol: Any = solve(system, solver, 0.0, 50.0, 5.0, REST, **options)
+    rate = -2 / (100 + (100**2 - 4) ** 0.5)
+    q, p = last(sol)
+    assert abs(p[0] / (rate * q[0]) - 1) < 1e-3
+    assert abs(q[0] / np.exp(rate * 50) - 1) < 1e-3
 
 
 @pytest.mark.parametrize(

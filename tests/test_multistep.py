@@ -14,7 +14,8 @@ import pytest
 from helpers import assert_close, henon_heiles, pendulum, solve
 
 import diffrax_presym as dps
-from diffrax_presym._scheme._multistep import _TABLES
+from diffrax_presym._results import MULTISTEP_UNSTABLE, OTHER_HISTORY
+from diffrax_presym._scheme._multistep import _MOST_FRICTION, _TABLES
 
 
 ORDERS = tuple(_TABLES)
@@ -333,6 +334,65 @@ def test_energy_does_not_drift(order):
     errors = np.max(np.abs(np.reshape(energies[1:] + 0.5, (10, -1))), axis=1)
     assert errors[0] < {8: 3e-8, 10: 3e-9}[order]
     assert errors[-1] < 2 * errors[0] + 1e-13
+
+
+@pytest.mark.parametrize("adjoint", [FIXED, dfx.RecursiveCheckpointAdjoint()])
+@pytest.mark.parametrize("order, limit", [(8, 0.63), (10, 0.48)])
+def test_instability_is_reported(order, limit, adjoint):
+    """Of the fastest of three oscillators; and where no force acts nothing is."""
+    solver, y0 = dps.SymmetricMultistep(order), (jnp.ones(3), jnp.zeros(3))
+
+    def run(omega, n=400.0):
+        spring = dps.QuadraticPotential(jnp.array([omega, 0.1, 0.0]) ** 2)
+        term = dps.MechanicalSystem(dps.QuadraticKinetic(), spring)
+        options: dict = dict(adjoint=adjoint, throw=False)
+        return solve(term, solver, 0.0, n, 1.0, y0, **options)
+
+    for omega in (0.0, limit - 0.01):
+        sol: Any = run(omega)
+        assert sol.result == dfx.RESULTS.successful
+        assert abs(float(sol.ys[0][-1, 0]) - np.cos(omega * 400)) < 0.03
+    for omega in (limit + 0.02, 0.8, 1.5):
+        assert run(omega).result == MULTISTEP_UNSTABLE
+    assert run(3.0).result != dfx.RESULTS.successful
+
+
+@pytest.mark.parametrize("adjoint", [FIXED, dfx.RecursiveCheckpointAdjoint()])
+def test_the_history_of_another_solution(adjoint):
+    solver, term = dps.SymmetricMultistep(), system(0.1)
+    saveat = dfx.SaveAt(t1=True, solver_state=True)
+    options: dict = dict(saveat=saveat, adjoint=adjoint, throw=False)
+    half = solve(term, solver, 0.0, 2.0, 0.1, Y0, ONE, **options)
+    y = jax.tree.map(lambda x: x[-1], half.ys)
+    options |= dict(solver_state=half.solver_state)
+    rest = solve(term, solver, 2.0, 4.0, 0.1, y, ONE, **options)
+    exact = ends(term, EXACT, 0.0, 4.0, 0.05, Y0, ONE)
+    assert_close(rest.ys, exact, 1e-8)
+    rest = solve(term, solver, 2.0, 4.0, 0.1, (y[0], y[1] + 1e-3), ONE, **options)
+    assert rest.result == OTHER_HISTORY
+
+
+def test_a_force_that_passes_through_zero():
+    """In Diffrax's loop each step is checked, at long steps that are stable."""
+    rate, y0 = dps.ConstantDamping(0.1), (jnp.ones(1), jnp.zeros(1))
+    term = dps.MechanicalSystem(dps.QuadraticKinetic(), pendulum, rate)
+    ys = ends(term, dps.SymmetricMultistep(), 0.0, 100.0, 0.5, y0)
+    assert_close(ys, ends(term, EXACT, 0.0, 100.0, 0.1, y0), 1e-3)
+
+
+def test_most_friction():
+    """The rate of the slow motion, from the largest root of the method."""
+    for order, most in _MOST_FRICTION.items():
+        table = _TABLES[order]
+        alpha = np.convolve(table.kicks, [1, -2, 1])
+        beta = np.array([0, *table.forces, 0])
+
+        def error(x, alpha=alpha, beta=beta):
+            root = np.max(np.abs(np.roots(alpha - (x**2 / 4 - 1e-4) * beta)))
+            rate = (x**2 / 4 - 1e-4) ** 0.5 - x / 2
+            return abs((np.log(root) - x / 2) / rate - 1)
+
+        assert error(most) < 0.1 < error(1.02 * most)
 
 
 def test_bad_input():

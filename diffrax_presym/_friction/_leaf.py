@@ -23,6 +23,11 @@ class EntryFriction(eqx.Module):
     def is_autonomous(self) -> bool:
         return all(law.is_autonomous for law, _ in self.terms)
 
+    @property
+    def is_known(self) -> bool:
+        (law, _), *others = self.terms
+        return not others and type(law).effect is not AbstractLogScale.effect
+
     def prepare(self, t: Time, h: Time, order: int) -> Effect:
         if len(self.terms) == 1:
             ((law, rate),) = self.terms
@@ -60,6 +65,14 @@ class EntryFriction(eqx.Module):
     def growth(self, t: Time, h: Time) -> Scalar:
         return jnp.max(increment(self.terms, t, h), initial=-jnp.inf)
 
+    def over(self, t: Time, h: Time) -> Scalar:
+        each = jnp.abs(increment(self.terms, t, h))
+        if not self.is_autonomous:
+            end = jnp.maximum(t, t + h)
+            rates = [cast_to(rate, h) * law.rate(end) for law, rate in self.terms]
+            each = jnp.minimum(each, jnp.abs(functools.reduce(jnp.add, rates) * h))
+        return jnp.max(each, initial=0)
+
     def is_singular(self, t: Time) -> Bool[Array, ""] | None:
         return reduce_any([law.is_singular(t) for law, _ in self.terms])
 
@@ -69,6 +82,7 @@ class MatrixFriction(eqx.Module):
 
     matrix: Inexact[Array, "*batch n n"]
     is_autonomous = True
+    is_known = True
 
     def prepare(self, t: Time, h: Time, order: int) -> Effect:
         return Effect(*[as_time(h)] * 3)
@@ -108,6 +122,14 @@ class MatrixFriction(eqx.Module):
         radius = jnp.sum(jnp.abs(symmetric), axis=-1) - jnp.abs(diagonal)
         forwards, backwards = jnp.max(radius + diagonal), jnp.max(radius - diagonal)
         return jnp.where(h > 0, forwards, backwards) * jnp.abs(h)
+
+    def over(self, t: Time, h: Time) -> Scalar:
+        matrix = cast_to(self.matrix, h := as_time(h))
+        symmetric = (matrix + jnp.swapaxes(matrix, -1, -2)) / 2
+        # At least this, the length of a column: a bound from above might fail a solve
+        # that is right.
+        column = jnp.sqrt(jnp.sum(symmetric**2, axis=-2))
+        return jnp.max(column, initial=0) * jnp.abs(h)
 
     def is_singular(self, t: Time) -> None:
         return None

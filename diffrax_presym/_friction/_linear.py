@@ -45,6 +45,12 @@ class LinearFriction(eqx.Module):
         leaves = jtu.tree_leaves(self.leaves, is_leaf=_is_leaf)
         return all(leaf.is_autonomous for leaf in leaves)
 
+    @property
+    def is_known(self) -> bool:
+        """Whether what it does is known in closed form."""
+        leaves = jtu.tree_leaves(self.leaves, is_leaf=_is_leaf)
+        return all(leaf.is_known for leaf in leaves)
+
     def prepare(self, t: Time, h: Time, order: int) -> Effects:
         """What it does from `t` to `t + h`; of at least the given order in `h` where it
         is not known in closed form."""
@@ -88,6 +94,12 @@ class LinearFriction(eqx.Module):
         """The logarithm of the factor by which errors of `p` grow from `t + h` back to
         `t`."""
         return functools.reduce(jnp.maximum, self._each("growth", t, h))
+
+    def over(self, t: Time, h: Time) -> Scalar:
+        """The largest friction over a span: the logarithm of the factor by which a
+        momentum decays or grows, but no more than at the rate at the end. A momentum
+        that obeys a force has no longer memory."""
+        return functools.reduce(jnp.maximum, self._each("over", t, h))
 
     def is_singular(self, t: Time) -> Bool[Array, ""] | None:
         """Whether it is infinite at `t`; `None` if it never is."""

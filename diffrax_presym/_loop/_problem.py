@@ -15,6 +15,7 @@ from .. import _tree as tree
 from .._numbers import Scalar, State
 from .._scheme._base import AbstractPresymplecticSolver, advance, between, Point
 from .._scheme._engine import backward, is_autonomous, prepare, prepare_once, Result
+from .._scheme._failure import explain, unless_too_strong
 from .._system._bound import System
 from ._steps import Rows, Steps
 
@@ -42,6 +43,8 @@ class Problem(eqx.Module):
     functions: Functions
     start: Point
     undo: Callable[[Array, Point], Point] | None  # the inverse of a step
+    # The result of so many steps to an end, from one without its reason.
+    explain: Callable[[Array, Point, dfx.RESULTS], dfx.RESULTS]
     growth: Scalar | None  # of rounding errors backwards in time, its logarithm
     steps: Steps
     rows: list[Rows]
@@ -69,8 +72,11 @@ class Problem(eqx.Module):
         once = steps.are_equal and is_autonomous(scheme.moves, system)
 
         def prepared(backward: bool) -> PyTree:
-            span = steps.span(system, n)
-            return prepare_once(scheme.moves, system, span, backward) if once else None
+            if not once:
+                return None
+            span, most = steps.span(system, n), scheme.most_friction
+            data = prepare_once(scheme.moves, system, span, backward)
+            return data if backward else unless_too_strong(most, system, span, data)
 
         data = prepared(False)
 
@@ -80,6 +86,14 @@ class Problem(eqx.Module):
         def shorter(n: Array, point: Point, t: Array) -> State:
             t0, t = system.time(steps.time(n)), system.time(t)
             return between(scheme, system, t0, point, t)
+
+        def explained(n: Array, end: Point, result: dfx.RESULTS) -> dfx.RESULTS:
+            time, spans = (
+                lambda n: system.time(steps.time(n)),
+                partial(steps.span, system),
+            )
+            ends = (time(0 * n), start), (time(n), end)
+            return explain(scheme, system, spans, n, ends, result)
 
         convert = eqx.filter_closure_convert
         values = start[0]
@@ -91,6 +105,8 @@ class Problem(eqx.Module):
             convert(step, n, start), convert(shorter, n, start, t0), outputs
         )
         self.start, self.steps, self.max_steps = start, steps, max_steps
+        traced = jtu.tree_map(jnp.asarray, dfx.RESULTS.successful)
+        self.explain = convert(explained, n, start, traced)
         self.undo = self.growth = None
         if reversal:
             back = prepared(True)

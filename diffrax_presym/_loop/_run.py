@@ -99,6 +99,7 @@ def run(problem: Problem, keep: Array | None = None):
     result = success if progress.result is None else progress.result
     bad = (result == success) & ~finite
     result = dfx.RESULTS.where(bad, NONFINITE, result)
+    result = problem.explain(progress.n, progress.point, result)
     short = (result == success) & (progress.n < problem.steps.total)
     result = dfx.RESULTS.where(short, dfx.RESULTS.max_steps_reached, result)
     trace = Trace(progress.n, progress.point, starts, kept)

@@ -1,5 +1,6 @@
 import abc
 import bisect
+import math
 from collections.abc import Callable
 from typing import ClassVar, NamedTuple
 
@@ -16,6 +17,8 @@ from .._results import NONFINITE
 from .._system._base import check_state
 from .._system._bound import bind, System, unwrap
 from ._engine import first_failure, forward, Moves, prepare, Result, Span
+from ._failure import explain, unless_too_strong
+from ._strong_friction import Pattern
 
 
 # Points within a step that dense output uses, from the order up to which they suffice.
@@ -41,6 +44,12 @@ class Scheme(NamedTuple):
     # Why steps of unequal length must not be composed: these cancel errors only if the
     # errors are even in the step size.
     not_composable: str | None = None
+    # A failure where a state and its solver state are wrong, before a step or after it.
+    check: Callable[[System, Array, State, PyTree], dfx.RESULTS] | None = None
+    # The most friction over a step that it resolves.
+    most_friction: float = math.inf
+    # The maps that it consists of, if these are known.
+    pattern: Pattern = ()
 
 
 class AbstractPresymplecticSolver(dfx.AbstractSolver):
@@ -102,6 +111,8 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver):
         )
         info = dense_info(self, scheme, system, span, start, end)
         result = first_failure(result, finite)
+        ends = (t0, start), (t1, end)
+        result = explain(scheme, system, lambda _: span, 1, ends, result)
         return end[0], None, info, end[1], result
 
     def func(self, terms, t0, y0, args):
@@ -114,6 +125,7 @@ def advance(
     """One step; `data` is what was prepared for it, if it was."""
     if data is None:
         data = prepare(scheme.moves, system, span)
+        data = unless_too_strong(scheme.most_friction, system, span, data)
     end, result = forward(scheme.moves, system, span, data, start)
     return end, first_failure(result, system.check(span.t1, system.values(end[0])))
 

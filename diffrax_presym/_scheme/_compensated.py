@@ -79,8 +79,11 @@ class Compensated(AbstractPresymplecticSolver):
             lost = tree.zeros(y)
             return base.start(system, t, jtu.tree_map(tree.Sum, y, lost)), lost
 
+        inner = base.check
+        check = inner and (lambda system, t, y, x: inner(system, t, y, x[0]))
         return base._replace(
             moves=Stages(moves, [(0, 0, 0), (0, 1, 1), (1, 1, 0)]),
             start=start,
             end_force=lambda carry: base.end_force(carry[0]),
+            check=check,
         )

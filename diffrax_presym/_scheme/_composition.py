@@ -1,5 +1,6 @@
 """Compositions: several steps of a scheme as one, each a list of weights."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from decimal import Decimal, localcontext
@@ -11,6 +12,7 @@ from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, check_base, Scheme
 from ._engine import Stages
 from ._frozen import PresymplecticLeapfrog
+from ._strong_friction import friction_limit, part_of
 
 
 class Composition(AbstractPresymplecticSolver):
@@ -75,7 +77,16 @@ class Composition(AbstractPresymplecticSolver):
         scheme = self.base.scheme(system)
         if len(set(self.weights)) > 1 and scheme.not_composable is not None:
             raise ValueError(scheme.not_composable)
-        return scheme._replace(moves=Stages([scheme.moves], stages(self.weights)))
+        parts = [part_of(scheme.pattern, weight) for weight in self.weights]
+        pattern = tuple(itertools.chain(*parts))
+        most = scheme.most_friction / max(map(abs, self.weights))
+        if most == math.inf:
+            most = friction_limit(system, pattern, self.order(None))
+        return scheme._replace(
+            moves=Stages([scheme.moves], stages(self.weights)),
+            most_friction=most,
+            pattern=pattern,
+        )
 
 
 def _leapfrog_if_none(base) -> AbstractPresymplecticSolver:

@@ -9,6 +9,7 @@ from ._base import AbstractPresymplecticSolver, Scheme
 from ._engine import inverse, Stages
 from ._moves import FrozenDrift, Kick
 from ._splitting import find_split, first_force
+from ._strong_friction import part_of, Pattern
 
 
 def _momentum_first(solver, system: System, known: bool = False) -> Stages:
@@ -21,6 +22,10 @@ def _momentum_first(solver, system: System, known: bool = False) -> Stages:
     find_split(solver, "separable", system)
     kick = Kick("separable", 1, known)
     return Stages([kick, FrozenDrift()], [(0, 0, 1), (0, 1, 1)])
+
+
+_EULER: Pattern = (("kick", 1.0, 0), ("move", 1.0, 0), ("decay", 1.0, 0))
+_HALF = part_of(_EULER, 0.5)
 
 
 def _check(first: Any) -> Any:
@@ -43,7 +48,7 @@ separable.
 
 
 class PresymplecticEuler(AbstractPresymplecticSolver):
-    """Presymplectic Euler's method.
+    r"""Presymplectic Euler's method.
 
     1st order. One force evaluation per step. Uses 3rd order Hermite interpolation for
     dense/ts output.
@@ -51,7 +56,10 @@ class PresymplecticEuler(AbstractPresymplecticSolver):
     For separable systems, for which the method is explicit; for others it would be
     implicit. The cheapest scheme. Not symmetric: the two variants are adjoint to each
     other. [`diffrax_presym.PresymplecticLeapfrog`][] has second order at the same cost;
-    use Euler only where this map itself is wanted, for example as an optimiser.
+    use Euler only where this map itself is wanted, for example as an optimiser. Under
+    strong friction, $x = h \gamma$, the slow motion is $x / (1 - e^{-x})$ times too
+    fast, and the momentum $x / (e^x - 1)$ times what it should be; with
+    `first="position"` the two factors are exchanged.
 
     Equations (presymp_euler) and (presymp_euler2) of França, Jordan
     and Vidal (2021).
@@ -70,14 +78,16 @@ class PresymplecticEuler(AbstractPresymplecticSolver):
 
     def scheme(self, system: System) -> Scheme:
         moves = _momentum_first(self, system)
-        return Scheme(moves if self.first == "momentum" else inverse(moves))
+        if self.first == "momentum":
+            return Scheme(moves, pattern=_EULER)
+        return Scheme(inverse(moves), pattern=_EULER[::-1])
 
 
 PresymplecticEuler.__init__.__doc__ = _ARGUMENTS
 
 
 class PresymplecticLeapfrog(AbstractPresymplecticSolver):
-    """The presymplectic leapfrog, also known as Störmer--Verlet.
+    r"""The presymplectic leapfrog, also known as Störmer--Verlet.
 
     2nd order and symmetric. One force evaluation per step. Uses 3rd order Hermite
     interpolation for dense/ts output.
@@ -97,6 +107,10 @@ class PresymplecticLeapfrog(AbstractPresymplecticSolver):
         step. After an event the solution ends inside that step. To continue from there,
         pass only the state `y` (the default), or the `solver_state` with
         `made_jump=True`.
+
+    Stable under any friction, at a rate $\gamma$ with $x = h \gamma$: the slow motion
+    is $(x / 2) \coth(x / 2)$ times too fast, and the momentum too large by this factor,
+    with `first="position"` $(x / 2) / \sinh(x / 2)$ times what it should be.
 
     Equations (presymp_leapfrog) and (presymp_leapfrog2) of França, Jordan
     and Vidal (2021).
@@ -119,11 +133,17 @@ class PresymplecticLeapfrog(AbstractPresymplecticSolver):
             A = _momentum_first(self, system, known=True)
             moves = Stages([A, inverse(A)], [(0, 0.5, 0.5), (0.5, 1, 0.5)])
             start = lambda system, t, y: first_force(system, "separable", t, y)
-            return Scheme(moves, start=start, end_force=lambda carry: carry)
+            return Scheme(
+                moves,
+                start=start,
+                end_force=lambda carry: carry,
+                pattern=_HALF + _HALF[::-1],
+            )
         # Two kicks at the same position are merged.
         kick, drift = _momentum_first(self, system).moves
         table = [(0, 0.5, 0.5), (0.5, 0.5, 1), (0.5, 1, 0.5)]
-        return Scheme(Stages([inverse(drift), kick, drift], table))
+        moves = Stages([inverse(drift), kick, drift], table)
+        return Scheme(moves, pattern=_HALF[::-1] + _HALF)
 
 
 PresymplecticLeapfrog.__init__.__doc__ = _ARGUMENTS

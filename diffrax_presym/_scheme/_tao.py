@@ -17,6 +17,11 @@ from ._base import AbstractPresymplecticSolver, Scheme
 from ._engine import AbstractMove, Outcome, Span, Stage, Stages
 
 
+# Over a step: the momentum of the slow motion of an overdamped oscillator is then twice
+# what it should be. Friction 3 / t from rest is within it.
+_MOST_FRICTION = 3.2
+
+
 class Exchange(AbstractMove):
     """The flow of `H(t, q, p_copy)`, equation (tao_map1), or of `H(t, q_copy, p)`, for
     the `second` copy. The field may be known, from the last exchange."""
@@ -115,7 +120,8 @@ class PresymplecticTao(AbstractPresymplecticSolver):
 
     The scheme of the paper for nonseparable Hamiltonians.
     [`diffrax_presym.PresymplecticGauss`][] is faster to almost any error, preserves the
-    structure in the phase space itself, and has no coupling to choose.
+    structure in the phase space itself, and has no coupling to choose. A step of more
+    friction than 3.2, the rate times its length, makes a solve fail.
 
     If the step is too long or the copies separate, a solve ends with
     `RESULTS.nonfinite` or has no accuracy: compare its energies. Take shorter steps, or
@@ -192,4 +198,9 @@ class PresymplecticTao(AbstractPresymplecticSolver):
                 "of the system, or `PresymplecticGauss(stages)`, which needs none."
             )
         moves = Stages(moves, table)
-        return Scheme(moves, start=start, not_composable=not_composable)
+        return Scheme(
+            moves,
+            start=start,
+            not_composable=not_composable,
+            most_friction=_MOST_FRICTION,
+        )

@@ -37,6 +37,10 @@ class AbstractKinetic(eqx.Module):
     def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
         r"""The velocity $\partial T / \partial p$."""
 
+    def flow_is_known(self, friction: LinearFriction | None) -> bool:
+        """Whether its flow is known in closed form."""
+        return False
+
     def prepare(
         self, friction: LinearFriction | None, t: Time, h: Time, order: int
     ) -> PyTree:
@@ -134,6 +138,9 @@ class QuadraticKinetic(AbstractKinetic):
     def momentum(self, v: PyTree) -> PyTree:
         """The momentum $M v$ of a velocity."""
         return multiply(self.mass, v, MASS, "q", self.symmetric)
+
+    def flow_is_known(self, friction) -> bool:
+        return friction is None or friction.is_known
 
     def prepare(self, friction, t, h, order):
         return None if friction is None else friction.prepare(t, h, order)

@@ -1,7 +1,7 @@
 """The splits of mechanical systems."""
 
 import math
-from typing import TYPE_CHECKING
+from typing import ClassVar, TYPE_CHECKING
 
 import equinox as eqx
 import jax.lax as lax
@@ -33,6 +33,9 @@ class KineticSplit(AbstractSplit):
     linear, otherwise a composition."""
 
     kinds: frozenset[str] = eqx.field(static=True)
+
+    def quadrature(self, system, order) -> int:
+        return 0 if system.term.kinetic.flow_is_known(system.friction) else order
 
     def prepare(self, system, t, h, order) -> PyTree:
         return system.term.kinetic.prepare(system.friction, t, h, order)
@@ -98,6 +101,10 @@ class PotentialSplit(AbstractSplit):
     kinds: frozenset[str] = eqx.field(
         static=True, default=frozenset({"any", "nystrom"})
     )
+    names: ClassVar[tuple[str, str]] = ("move", "push")
+
+    def quadrature(self, system, order) -> int:
+        return 0 if system.friction is None or system.friction.is_known else order
 
     def prepare(self, system, t, h, order) -> PyTree:
         friction = system.friction
@@ -128,6 +135,7 @@ class SharedSplit(AbstractSplit):
     """
 
     kinds: frozenset[str] = eqx.field(static=True)
+    names: ClassVar[tuple[str, str]] = ("shared kick", "shared drift")
 
     def _shift(self, system: "System", t: Time, y: State, sign: float) -> State:
         law = system.term.damping

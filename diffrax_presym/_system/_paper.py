@@ -99,6 +99,12 @@ class _ScaledKinetic(AbstractKinetic):
         assert friction is not None
         return friction
 
+    def flow_is_known(self, friction) -> bool:
+        if not self.is_quadratic:
+            return False
+        assert friction is not None
+        return friction.is_known and self._by_eta1(jnp.zeros(())).is_known
+
     def prepare(self, friction, t, h, order):
         if not self.is_quadratic:
             return super().prepare(friction, t, h, order)

@@ -14,7 +14,7 @@ What a drift needs of time alone is prepared, for all stages of a step at once.
 """
 
 import abc
-from typing import TYPE_CHECKING
+from typing import ClassVar, TYPE_CHECKING
 
 import equinox as eqx
 from jaxtyping import PyTree
@@ -51,6 +51,13 @@ class AbstractSplit(eqx.Module):
         """What a kick needs of the variables that it does not change."""
 
     # What is different for some splits.
+
+    # What a kick and a drift do, and how a drift integrates, see `_strong_friction.py`.
+    names: ClassVar[tuple[str, str]] = ("kick", "drift")
+
+    def quadrature(self, system: "System", order: int) -> int:
+        """The order of the quadratures in a drift, 0 if they are not needed."""
+        return 0
 
     def prepare(self, system: "System", t: Time, h: Time, order: int) -> PyTree:
         """What the drift from `t` to `t + h` needs of time alone. Nothing by

@@ -68,6 +68,11 @@ def power_lost(
     r"""The power lost to friction at each saved time, $-v \cdot F$ with the velocity
     $v$ and the force $F$ of all friction: $v \cdot C v$ for viscous friction.
 
+    It follows the saved momenta. Where friction over a step is of the order of one or
+    more, those of [`diffrax_presym.Strang`][], `PresymplecticLeapfrog` and
+    `PresymplecticEuler` are not resolved, and the power is wrong by the square of their
+    factor, which is in their docstrings.
+
     **Arguments:**
 
     As [`diffrax_presym.diagnostics.energy`][].
@@ -81,7 +86,9 @@ def energy_lost(
     """The energy lost to friction up to each saved time, the integral of
     [`diffrax_presym.diagnostics.power_lost`][].
 
-    Along the exact motion from each saved state to the next time.
+    Along the exact motion from each saved state to the next time, so that a momentum
+    that a coarse scheme does not resolve counts once for each saved time: see
+    [`diffrax_presym.diagnostics.power_lost`][].
 
     **Arguments:**
 
