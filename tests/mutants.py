@@ -26,6 +26,7 @@ class Mutant(NamedTuple):
     new: str
     of: tuple[str, ...] = ()  # what it concerns: entries that the rows have
     tests: str = "test_pairs.py"
+    only: str = ""  # of these tests
 
 
 MUTANTS = [
@@ -208,16 +209,16 @@ MUTANTS = [
     # The loop and its gradient.
     Mutant(
         "a saved row is shifted by one",
-        "_loop/_run.py",
+        "_loop/_problem.py",
         "stop = jnp.where(some, rows.stop[row], 0)",
         "stop = jnp.where(some, rows.stop[row] - 1, 0)",
         ("times",),
     ),
     Mutant(
         "a saved time is that of the end of its step",
-        "_loop/_run.py",
-        "times = system.time(begin), system.time(t)",
-        "times = system.time(begin), system.time(end)",
+        "_loop/_problem.py",
+        "functions.shorter(jnp.where(ended, n - 1, n), start, t)",
+        "functions.shorter(jnp.where(ended, n - 1, n), start, end)",
         ("times",),
     ),
     Mutant(
@@ -235,18 +236,103 @@ MUTANTS = [
         ("end",),
     ),
     Mutant(
-        "the cotangent of what a step prepared is dropped",
+        "the cotangents of what a step holds are dropped",
         "_loop/_backward.py",
-        "gradient = tree.sum(gradient, self._pull_prepared(fn, prepared))",
-        "gradient = gradient",
-        ("2 / (t + 1)", "reversal"),
+        "gradient, ends = tree.sum(at.gradient, more)",
+        "gradient, ends = tree.sum(at.gradient, _zeros(more))",
+        ("reversal",),
     ),
     Mutant(
-        "the cotangent of what all steps share is dropped",
-        "_loop/_backward.py",
-        "shared = tree.sum(shared, prepared)",
-        "shared = shared",
+        "what all steps share is not differentiated",
+        "_loop/_problem.py",
+        "data = prepared(False)",
+        "data = lax.stop_gradient(prepared(False))",
         ("constant", "reversal"),
+    ),
+    Mutant(
+        "a step between checkpoints is pulled back from the one before",
+        "_loop/_kept.py",
+        "lambda x: x[n - first]",
+        "lambda x: x[jnp.maximum(n - first - 1, 0)]",
+        ("checkpoints",),
+    ),
+    Mutant(
+        "a kept state is not the start of its step",
+        "_loop/_kept.py",
+        "n == first, lambda: known",
+        "n == first - 1, lambda: known",
+        tests="test_adjoint.py",
+        only="is_lost",
+    ),
+    Mutant(
+        "the error of recomputed states is not looked at",
+        "_loop/_kept.py",
+        "size(tree.sub(*at.ends))",
+        "0 * size(tree.sub(*at.ends))",
+        tests="test_adjoint.py",
+        only="is_lost",
+    ),
+    Mutant(
+        "a lost gradient is an error in a batch too",
+        "_loop/_kept.py",
+        "missed = _error_unless_batched(missed)",
+        "missed = eqx.error_if(missed, missed, _NOT_RECOMPUTED)",
+        tests="test_adjoint.py",
+        only="is_lost or not_taken",
+    ),
+    Mutant(
+        "the inverse of a step has no derivative",
+        "_loop/_problem.py",
+        "self.undo = convert(undo, n, start)",
+        "self.undo = jtu.tree_map(\n"
+        "    lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x,\n"
+        "    convert(undo, n, start))",
+        tests="test_adjoint.py",
+        only="second_derivatives",
+    ),
+    Mutant(
+        "gaps in the saved times have values",
+        "_loop/_steps.py",
+        "return self.reached(n) & (self.stop >= 0)",
+        "return self.reached(n)",
+        tests="test_steps.py",
+    ),
+    Mutant(
+        "steps go on after a failure",
+        "_loop/_run.py",
+        "return some & tree.all_finite(progress.point[0])",
+        "return some",
+        tests="test_steps.py",
+    ),
+    Mutant(
+        "an infinite step is none",
+        "_loop/_steps.py",
+        "jnp.where(spans > 0, jnp.maximum(numbers, 1), numbers)",
+        "numbers",
+        tests="test_steps.py",
+    ),
+    Mutant(
+        "prescribed steps may end anywhere",
+        "_loop/_steps.py",
+        "eqx.error_if(controller.ts, ~ends, _OTHER_ENDS)",
+        "controller.ts",
+        tests="test_steps.py",
+    ),
+    # Extensions.
+    Mutant(
+        "what a move prepares is shared by all stages",
+        "_scheme/_engine.py",
+        "return type(self).prepare is AbstractMove.prepare",
+        "return True",
+        ("own moves",),
+    ),
+    Mutant(
+        "a term holds an empty tuple",
+        "_system/_mechanical.py",
+        "as_laws(friction) or None",
+        "as_laws(friction)",
+        tests="test_diffrax_adjoints.py",
+        only="pendulum-none",
     ),
     Mutant(
         "the cotangent of the last of the rows is dropped",
@@ -323,6 +409,7 @@ def found(mutant: Mutant, rows: int) -> bool:
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "2"]
         command += ["-p", "no:cacheprovider", f"tests/{mutant.tests}"]
         command += ["-m", "not slow"] if mutant.tests == "test_pairs.py" else []
+        command += ["-k", mutant.only] if mutant.only else []
         environment = os.environ | {"PYTHONPATH": folder, "ROWS": str(rows)}
         environment["ENTRIES"] = "|".join(mutant.of)
         run = subprocess.run(

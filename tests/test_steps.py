@@ -20,7 +20,7 @@ PENDULUM = dps.MechanicalSystem(
 )
 
 
-def solve(dt0=0.1, *, size=1, solver=None, **options) -> Any:
+def solve(dt0: Any = 0.1, *, size=1, solver=None, **options) -> Any:
     y0 = jnp.full(size, 1.0), jnp.full(size, 0.3)
     options = {"max_steps": 100, "throw": False, "adjoint": OWN} | options
     solver = dps.TunedRKN6() if solver is None else solver
