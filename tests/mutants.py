@@ -217,8 +217,8 @@ MUTANTS = [
     Mutant(
         "a saved time is that of the end of its step",
         "_loop/_problem.py",
-        "functions.shorter(jnp.where(ended, n - 1, n), start, t)",
-        "functions.shorter(jnp.where(ended, n - 1, n), start, end)",
+        "within(jnp.where(ended, n - 1, n), start, t)",
+        "within(jnp.where(ended, n - 1, n), start, end)",
         ("times",),
     ),
     Mutant(

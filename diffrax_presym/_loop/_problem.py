@@ -33,7 +33,8 @@ class Functions(eqx.Module):
     """
 
     step: Callable[[Array, Point], tuple[Point, Result]]
-    shorter: Callable[[Array, Point, Array], State]  # the state within a step
+    # The state within a step, if any is saved.
+    shorter: Callable[[Array, Point, Array], State] | None
     outputs: list[Callable[[Array, State], PyTree]]  # of `SaveAt(fn=...)`
 
 
@@ -88,22 +89,20 @@ class Problem(eqx.Module):
             return between(scheme, system, t0, point, t)
 
         def explained(n: Array, end: Point, result: dfx.RESULTS) -> dfx.RESULTS:
-            time, spans = (
-                lambda n: system.time(steps.time(n)),
-                partial(steps.span, system),
-            )
+            time = lambda n: system.time(steps.time(n))
             ends = (time(0 * n), start), (time(n), end)
-            return explain(scheme, system, spans, n, ends, result)
+            span = partial(steps.span, system)
+            return explain(scheme, system, span, n, ends, result)
 
+        self.rows = [Rows(sub, steps, max_steps) for sub in subs]
+        some = any(rows.may_be_inside for rows in self.rows)
         convert = eqx.filter_closure_convert
-        values = start[0]
         outputs = [
-            convert(lambda t, y, fn=sub.fn: fn(t, y, system.args), t0, values)
+            convert(lambda t, y, fn=sub.fn: fn(t, y, system.args), t0, start[0])
             for sub in subs
         ]
-        self.functions = Functions(
-            convert(step, n, start), convert(shorter, n, start, t0), outputs
-        )
+        within = convert(shorter, n, start, t0) if some else None
+        self.functions = Functions(convert(step, n, start), within, outputs)
         self.start, self.steps, self.max_steps = start, steps, max_steps
         traced = jtu.tree_map(jnp.asarray, dfx.RESULTS.successful)
         self.explain = convert(explained, n, start, traced)
@@ -124,7 +123,6 @@ class Problem(eqx.Module):
                 begin, end = (system.time(steps.time(n)) for n in (first, self.last))
                 growth = system.friction.growth(begin, end - begin)
                 self.growth = lax.stop_gradient(growth)
-        self.rows = [Rows(sub, steps, max_steps) for sub in subs]
         without_fn = lambda sub: eqx.tree_at(lambda x: x.fn, sub, None)
         self.subs = list(map(without_fn, subs))
         self.progress_meter, self.meter = meters
@@ -157,7 +155,9 @@ class Problem(eqx.Module):
         begin, end = jnp.where(ended, last, begin), jnp.where(ended, begin, end)
         length = jnp.where(end > begin, end - begin, 1)
         t = jnp.where(inside, t, begin + length / 2)
-        step = lambda: functions.shorter(jnp.where(ended, n - 1, n), start, t)
+        assert functions.shorter is not None
+        within = functions.shorter
+        step = lambda: within(jnp.where(ended, n - 1, n), start, t)
         if shorter is not None:
             return step() if shorter else start[0]
         if self.at_once:
