@@ -125,12 +125,14 @@ endef
 $(BIN)/pip:
 	$(call venv,$(VENV),$(VERSIONS))
 
-# The oldest Python, and the lowest versions that `pyproject.toml` allows.
+# The oldest Python, and the lowest versions that `pyproject.toml` allows and that need
+# no compiler there.
 $(OLDEST)/.installed: pyproject.toml | $(BIN)/pip
 	@rm -rf $(OLDEST)
 	$(call venv,$(OLDEST),$(sort $(VERSIONS)))
 	@echo "Installing the oldest allowed dependencies into $(OLDEST) ..."
 	@$(BIN)/python $(PIP) uv
 	@$(BIN)/uv --quiet pip install --python $(OLDEST)/bin/python \
-		--resolution lowest-direct --editable '.[tests]'
+		--resolution lowest-direct --only-binary scipy --only-binary matplotlib \
+		--editable '.[tests]'
 	@touch $@
