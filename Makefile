@@ -3,6 +3,14 @@
 
 # To choose the interpreter: `make PYTHON=/path/to/python test`.
 PYTHON ?=
+# The versions that the tests run on. Version managers put stubs on the path that fail
+# until a version is selected, so the interpreters that they hold are candidates too.
+VERSIONS := 3.13 3.12 3.11
+MANAGED := $(or $(PYENV_ROOT),$(HOME)/.pyenv)/versions \
+	$(or $(ASDF_DATA_DIR),$(HOME)/.asdf)/installs/python \
+	$(HOME)/.local/share/mise/installs/python $(HOME)/.local/share/uv/python
+candidates = $(or $(PYTHON),$(foreach version,$(1),python$(version) \
+	$(wildcard $(addsuffix /*/bin/python$(version),$(MANAGED)))) python3)
 VENV := .venv
 OLDEST := .venv-oldest
 BIN := $(VENV)/bin
@@ -98,24 +106,33 @@ $(VENV)/.with-%: pyproject.toml | $(BIN)/pip
 	@$(BIN)/python $(PIP) --editable '.[$*]'
 	@touch $@
 
-# Each candidate is executed, since version managers may put stubs on the path.
-$(BIN)/pip:
-	@for python in $(or $(PYTHON),python3.13 python3.12 python3.11 python3); do \
-		if "$$python" -c 'import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))' \
-			>/dev/null 2>&1; then \
-			echo "Creating $(VENV) with $$python ..."; \
-			exec "$$python" -m venv $(VENV); \
-		fi; \
-	done; \
-	echo "No usable Python found (tried: $(or $(PYTHON),python3.13 python3.12 python3.11 python3))." >&2; \
-	echo "Python 3.11 or newer is needed, with its venv module (on Debian and Ubuntu: apt-get install python3-venv). Choose one with 'make PYTHON=/path/to/python ...'." >&2; \
-	exit 1
+# $(call venv,folder,versions): an environment of the first candidate that runs.
+define venv
+@for python in $(call candidates,$(2)); do \
+	if found=$$("$$python" -c 'import ensurepip, sys, venv; \
+			sys.exit("too old") if sys.version_info < (3, 11) else print(sys.version)' \
+			2>/dev/null); then \
+		echo "Creating $(1) with Python $${found%% *} ($$python) ..."; \
+		exec "$$python" -m venv $(1); \
+	fi; \
+done; \
+echo "No usable Python found (tried: $(call candidates,$(2)))." >&2; \
+echo "Python 3.11 or newer is needed, with its venv module (on Debian and Ubuntu: apt-get install python3-venv). Choose one with 'make PYTHON=/path/to/python ...'." >&2; \
+exit 1
+endef
 
-# The lowest versions that `pyproject.toml` allows.
+# The newest Python.
+$(BIN)/pip:
+	$(call venv,$(VENV),$(VERSIONS))
+
+# The oldest Python, and the lowest versions that `pyproject.toml` allows and that need
+# no compiler there.
 $(OLDEST)/.installed: pyproject.toml | $(BIN)/pip
+	@rm -rf $(OLDEST)
+	$(call venv,$(OLDEST),$(sort $(VERSIONS)))
 	@echo "Installing the oldest allowed dependencies into $(OLDEST) ..."
 	@$(BIN)/python $(PIP) uv
-	@$(BIN)/uv --quiet venv --clear --python $(BIN)/python $(OLDEST)
 	@$(BIN)/uv --quiet pip install --python $(OLDEST)/bin/python \
-		--resolution lowest-direct --editable '.[tests]'
+		--resolution lowest-direct --only-binary scipy --only-binary matplotlib \
+		--editable '.[tests]'
 	@touch $@

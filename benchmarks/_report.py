@@ -1,10 +1,18 @@
 """The command line of the benchmarks, and the tables that they print."""
 
 import argparse
+import functools
+import importlib.metadata
 import math
+import os
+import platform
 import re
 import statistics
 import sys
+
+import jax
+
+import diffrax_presym as dps
 
 
 def command_line(doc):
@@ -15,6 +23,21 @@ def command_line(doc):
     parser.add_argument("--quick", action="store_true", help="a short run, for CI")
     parser.add_argument("--markdown", action="store_true", help="tables as Markdown")
     return parser
+
+
+@functools.cache
+def environment():
+    """Print the versions and the device, above the first table of a script."""
+    versions = [
+        f"Python {platform.python_version()}",
+        *(
+            f"{name} {importlib.metadata.version(name)}"
+            for name in ("jax", "jaxlib", "diffrax", "equinox")
+        ),
+        f"diffrax_presym {dps.__version__}",
+    ]
+    kind = jax.devices()[0].device_kind
+    print(f"{', '.join(versions)}; {os.cpu_count()} CPU cores, device: {kind}")
 
 
 def means(rows):
@@ -38,10 +61,10 @@ class Table:
         columns = [column.rpartition(":") for column in columns]
         self.formats = [spec for _, _, spec in columns]
         self.markdown = "--markdown" in sys.argv[1:]
-        if caption is not None:
-            print(f"\n{caption}".rstrip(" ") if caption else "")
-            if caption and self.markdown:
-                print()
+        environment()
+        print(f"\n{caption}" if caption else "")
+        if caption and self.markdown:
+            print()
         self.row(*(title for title, _, _ in columns))
         if self.markdown:
             print("|" + "---|" * len(columns), flush=True)

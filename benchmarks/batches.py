@@ -275,7 +275,7 @@ def main():
     repeats = 1 if quick else 5
     longest = options.longest or (0.3 if quick else 12.0)
     sizes = (1, 64, 256) if quick else SIZES
-    print(f"{jax.devices()[0].device_kind}, median of {repeats} runs")
+    print(f"Median of {repeats} runs")
     methods = [OURS[2], RIVALS[3]] if quick else OURS + RIVALS
     scaling(PENDULUMS, methods, sizes, repeats, longest)
     few = [m for m in methods if m in OURS[2:] + RIVALS[3:]]

@@ -62,7 +62,7 @@ def main():
     names = list(PROBLEMS)[: 1 if quick else None]
     systems = [(problem := PROBLEMS[name](), problem.reference()) for name in names]
     columns = [f"{name}:>8.2g" for name in (*names, "mean")]
-    table = Table(None, "times less error:<34", *columns, "h omega:>7.3f")
+    table = Table("", "times less error:<34", *columns, "h omega:>7.3f")
     base = {}
     for name in NAMES:
         scheme = SCHEMES[name]

@@ -365,7 +365,7 @@ def main():
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     titles = ("1e-3", "1e-6", "1e-9", "h^3", "h^5", "h^7")
-    table = Table(None, ":<21", *(f"{title}:>7.3f" for title in titles))
+    table = Table("", ":<21", *(f"{title}:>7.3f" for title in titles))
     for name in SCHEMES + TUNED:
         tableau = getattr(dps, name).tableau
         describe(table, name, jnp.array(tableau.fractions), tableau.kick_first)

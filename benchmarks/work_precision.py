@@ -13,17 +13,14 @@ the package was tuned on the test half. Where bodies attract each other, splitti
 also run with the variable steps of `StepDensityController`, as
 the documentation advises for close encounters. `--saved` saves at 201 times, where the
 error is the largest over these, relative to the largest entry of the solution.
-`--raised` raises XLA's limit for loops that it compiles into one function on a CPU, for
-every method, as docs/speed.md explains. A further table has the ratio of the numbers of
-force evaluations. That of schemes which are not explicit is an estimate.
+A further table has the ratio of the numbers of force evaluations. That of schemes which
+are not explicit is an estimate.
 """
 
 import concurrent.futures
 import math
 import multiprocessing
-import os
 import pathlib
-import platform
 import time
 from functools import partial
 
@@ -68,7 +65,6 @@ SETS = {
     "test": problems_test.PROBLEMS,
 }
 SAVED = 201
-RAISED = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000"
 GROUPS = ("ours", "Diffrax", "heyoka")
 
 
@@ -247,7 +243,6 @@ def main():
     parser.add_argument("--output", type=pathlib.Path, default=FOLDER)
     parser.add_argument("--set", choices=SETS, default="seven")
     parser.add_argument("--saved", action="store_true", help="save at 201 times")
-    parser.add_argument("--raised", action="store_true", help="XLA's limit for loops")
     parser.add_argument("--only", nargs="+", help="parts of the names of problems")
     options = parser.parse_args()
     repeats = 1 if options.quick else options.repeats
@@ -257,9 +252,7 @@ def main():
         wanted = lambda make: any(part in make().name for part in options.only)
         makers = list(filter(wanted, makers))
     results = {}
-    print(f"{platform.processor() or platform.machine()}, median of {repeats} runs")
-    if options.raised:
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {RAISED}"
+    print(f"Median of {repeats} runs")
     # A process for each problem: compiled programs are kept until it ends.
     spawn = multiprocessing.get_context("spawn")
     for make in makers:
