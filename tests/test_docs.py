@@ -189,6 +189,8 @@ DOCUMENTED_AS_A_WHOLE = {
     "diagnostics.WorkPrecisionRun",
     "extend.Damping",
     "extend.HermiteInterpolation",
+    "extend.Mechanics",
+    "extend.Parts",
     "extend.Scheme",
     "extend.Span",
     "extend.Stages",

@@ -69,6 +69,19 @@ class Kick(AbstractMove):
         return (y, force if self.known else carry), None
 
 
+_ARGUMENTS = """**Arguments:**
+
+- `kind`: the kind of split that the system must offer: `"separable"`, `"any"`,
+    `"nystrom"`, `"shared"` or `"linear"`.
+- `order`: the order in the step to which a flow without closed form is computed.
+"""
+Drift.__init__.__doc__ = _ARGUMENTS
+Kick.__init__.__doc__ = f"""{_ARGUMENTS}- `known`: whether the kick starts a step, by the
+    force that the last step left as solver state; its inverse ends a step, and leaves
+    the force. Defaults to `False`.
+"""
+
+
 class FrozenDrift(AbstractMove):
     """A drift by the velocity at its start; the inverse is by that at its end."""
 
