@@ -76,12 +76,10 @@ _ARGUMENTS = """**Arguments:**
 - `order`: the order in the step to which a flow without closed form is computed.
 """
 Drift.__init__.__doc__ = _ARGUMENTS
-Kick.__init__.__doc__ = (
-    _ARGUMENTS
-    + """- `known`: whether the kick starts a step, by the force that the last step left as
-    solver state; its inverse ends a step, and leaves the force. Defaults to `False`.
+_KNOWN = """- `known`: whether the kick starts a step, by the force that the last step
+    left; its inverse ends a step, and leaves the force. Defaults to `False`.
 """
-)
+Kick.__init__.__doc__ = _ARGUMENTS + _KNOWN
 
 
 class FrozenDrift(AbstractMove):
