@@ -22,9 +22,11 @@ def density(logs, adjoint):
         gamma, k = jnp.exp(logs)
         energy = dps.QuadraticKinetic(), lambda t, q, args: -k * jnp.cos(q)
         sol = dfx.diffeqsolve(
-            *(dps.MechanicalSystem(*energy, dps.ConstantDamping(gamma)),),
+            dps.MechanicalSystem(*energy, dps.ConstantDamping(gamma)),
             *(dps.TunedRKN6(), 0.0, 20.0, 0.5, (jnp.asarray(1.5), jnp.asarray(0.0))),
-            **dict(saveat=dfx.SaveAt(ts=TS), adjoint=adjoint, max_steps=40),
+            saveat=dfx.SaveAt(ts=TS),
+            adjoint=adjoint,
+            max_steps=40,
             throw=False,
         )
         assert sol.ys is not None
