@@ -141,9 +141,11 @@ def test_pages_draw_the_pictures_they_show(page):
 
 
 def test_recipes_for_other_libraries_are_those_of_the_examples():
-    blocks = list(FENCE.finditer((ROOT / "docs" / "howto" / "clients.md").read_text()))
-    recipes = [x["code"] for x in blocks if x["code"].startswith("# examples/")]
-    assert len(recipes) == len(list((ROOT / "examples" / "clients").glob("[!_]*.py")))
+    pages = (ROOT / "docs" / "howto" / f"{x}.md" for x in ("clients", "sampling"))
+    blocks = [x["code"] for page in pages for x in FENCE.finditer(page.read_text())]
+    recipes = [x for x in blocks if x.startswith(("# examples/", "# benchmarks/"))]
+    clients = list((ROOT / "examples" / "clients").glob("[!_]*.py"))
+    assert len(recipes) == len(clients) + 3
     for recipe in recipes:
         first, code = recipe.split("\n", 1)
         assert code in (ROOT / first[2:].split(",")[0]).read_text()
