@@ -141,6 +141,33 @@ def test_strong_friction(solver, below, above, adjoint):
     assert np.isnan(q) and np.isnan(p) and result == FRICTION_TOO_STRONG
 
 
+def by_place(gamma):
+    return dps.PositionDamping(lambda t, q, args: gamma + 0 * q)
+
+
+def by_matrix(gamma):
+    return dps.PositionDamping(lambda t, q, args: gamma * jnp.eye(1))
+
+
+@pytest.mark.parametrize("adjoint", [FIXED, dfx.RecursiveCheckpointAdjoint()])
+@pytest.mark.parametrize("friction", [by_place, by_matrix])
+@pytest.mark.parametrize(
+    "solver, below, above",
+    [
+        (dps.Strang(), 300.0, None),
+        (dps.BlanesMoan4(), 32.0, (33.0, 100.0)),
+        (dps.BlanesMoan6(), 34.0, (35.0, 100.0)),
+        (dps.SofroniouSpaletta(8, dps.Strang()), 24.0, (25.0, 100.0)),
+    ],
+)
+def test_strong_friction_in_kicks(solver, below, above, friction, adjoint):
+    q, p, result = slow_motion(solver, below, adjoint, friction)
+    assert q < 0.12 and p < 0.12 and result == dfx.RESULTS.successful
+    for h_gamma in above or ():
+        q, p, result = slow_motion(solver, h_gamma, adjoint, friction)
+        assert np.isnan(q) and np.isnan(p) and result != dfx.RESULTS.successful
+
+
 @pytest.mark.parametrize("h_gamma", [0.5, 5.0, 100.0])
 def test_momentum_of_coarse_schemes_under_strong_friction(h_gamma):
     """After the last half of a kick it is (x / 2) coth(x / 2) times what a constant

@@ -23,6 +23,12 @@ if TYPE_CHECKING:
     from ._bound import System
 
 
+# The most friction over a kick back in time. It amplifies the distance of a momentum
+# from that of the slow motion. By `friction_limit` of a "push" and a "move" the schemes
+# of order four and more resolve from 4.6 (`SofroniouSpaletta(8, Strang())`) to 8.8.
+_MOST_BACK = math.log(100)
+
+
 def _potential_force(system: "System", t: Time, y: State) -> PyTree:
     return system.term.potential.force(t, tree.values(y)[0], system.args)
 
@@ -68,12 +74,9 @@ class KineticSplit(AbstractSplit):
         def pushed(dp: PyTree, h: Time) -> PyTree:
             if friction is None:
                 return tree.add(dp, h, force)
-            # As in drifts, a stage back in time must not amplify rounding too much.
-            # Of a matrix nothing is known here but the time.
-            most, back = 1 / math.sqrt(friction.precision), as_time(h) < 0
+            bad = (as_time(h) < 0) & (friction.over(t, h) > _MOST_BACK)
             data = jtu.tree_map(
-                lambda x: jnp.where(back & (x > most), jnp.nan, x),
-                friction.prepare(t, h, order),
+                lambda x: jnp.where(bad, jnp.nan, x), friction.prepare(t, h, order)
             )
             gained = friction.decay(data, tree.sum(p, dp))
             return tree.sum(dp, tree.sum(gained, friction.respond(data, force)))
