@@ -141,6 +141,22 @@ def test_strong_friction(solver, below, above, adjoint):
     assert np.isnan(q) and np.isnan(p) and result == FRICTION_TOO_STRONG
 
 
+def test_gradient_under_friction_that_is_too_strong():
+    """It is not finite, as the solution is not, rather than zero."""
+
+    def loss(gamma, adjoint):
+        system = damped(harmonic, dps.ConstantDamping(gamma))
+        options: dict = dict(adjoint=adjoint, throw=False)
+        sol: Any = solve(system, RKN4, 0.0, 4.0, 1.0, REST, **options)
+        return jnp.sum(sol.ys[0])
+
+    for adjoint in (FIXED, dfx.RecursiveCheckpointAdjoint()):
+        assert np.isnan(jax.grad(loss)(200.0, adjoint))
+        each = jax.vmap(lambda gamma, a=adjoint: jax.grad(loss)(gamma, a))
+        lost, kept = each(jnp.array([200.0, 1.0]))
+        assert np.isnan(lost) and np.isfinite(kept)
+
+
 def by_place(gamma):
     return dps.PositionDamping(lambda t, q, args: gamma + 0 * q)
 

@@ -6,7 +6,6 @@ from typing import ClassVar, TYPE_CHECKING
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import PyTree
 
 from .. import _tree as tree
@@ -75,9 +74,7 @@ class KineticSplit(AbstractSplit):
             if friction is None:
                 return tree.add(dp, h, force)
             bad = (as_time(h) < 0) & (friction.over(t, h) > _MOST_BACK)
-            data = jtu.tree_map(
-                lambda x: jnp.where(bad, jnp.nan, x), friction.prepare(t, h, order)
-            )
+            data = tree.invalid_if(bad, friction.prepare(t, h, order))
             gained = friction.decay(data, tree.sum(p, dp))
             return tree.sum(dp, tree.sum(gained, friction.respond(data, force)))
 
