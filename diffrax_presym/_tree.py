@@ -78,6 +78,11 @@ def scale(c: ArrayLike, y: PyTree) -> PyTree:
     return jtu.tree_map(lambda yi: cast_to(c, yi) * yi, y)
 
 
+def invalid_if(bad: Bool[Array, ""], y: PyTree) -> PyTree:
+    """`y`, or NaN if it is `bad`: a product, so that its gradient is NaN too."""
+    return scale(jnp.where(bad, jnp.nan, 1.0), y)
+
+
 def zeros(x: PyTree) -> PyTree:
     """Arrays of zeros like the leaves, which may be `Sum`s."""
     return jtu.tree_map(jnp.zeros_like, values(x))

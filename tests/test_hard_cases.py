@@ -141,6 +141,49 @@ def test_strong_friction(solver, below, above, adjoint):
     assert np.isnan(q) and np.isnan(p) and result == FRICTION_TOO_STRONG
 
 
+def test_gradient_under_friction_that_is_too_strong():
+    """It is not finite, as the solution is not, rather than zero."""
+
+    def loss(gamma, adjoint):
+        system = damped(harmonic, dps.ConstantDamping(gamma))
+        options: dict = dict(adjoint=adjoint, throw=False)
+        sol: Any = solve(system, RKN4, 0.0, 4.0, 1.0, REST, **options)
+        return jnp.sum(sol.ys[0])
+
+    for adjoint in (FIXED, dfx.RecursiveCheckpointAdjoint()):
+        assert np.isnan(jax.grad(loss)(200.0, adjoint))
+        each = jax.vmap(lambda gamma, a=adjoint: jax.grad(loss)(gamma, a))
+        lost, kept = each(jnp.array([200.0, 1.0]))
+        assert np.isnan(lost) and np.isfinite(kept)
+
+
+def by_place(gamma):
+    return dps.PositionDamping(lambda t, q, args: gamma + 0 * q)
+
+
+def by_matrix(gamma):
+    return dps.PositionDamping(lambda t, q, args: gamma * jnp.eye(1))
+
+
+@pytest.mark.parametrize("adjoint", [FIXED, dfx.RecursiveCheckpointAdjoint()])
+@pytest.mark.parametrize("friction", [by_place, by_matrix])
+@pytest.mark.parametrize(
+    "solver, below, above",
+    [
+        (dps.Strang(), 300.0, None),
+        (dps.BlanesMoan4(), 32.0, (33.0, 100.0)),
+        (dps.BlanesMoan6(), 34.0, (35.0, 100.0)),
+        (dps.SofroniouSpaletta(8, dps.Strang()), 24.0, (25.0, 100.0)),
+    ],
+)
+def test_strong_friction_in_kicks(solver, below, above, friction, adjoint):
+    q, p, result = slow_motion(solver, below, adjoint, friction)
+    assert q < 0.12 and p < 0.12 and result == dfx.RESULTS.successful
+    for h_gamma in above or ():
+        q, p, result = slow_motion(solver, h_gamma, adjoint, friction)
+        assert np.isnan(q) and np.isnan(p) and result != dfx.RESULTS.successful
+
+
 @pytest.mark.parametrize("h_gamma", [0.5, 5.0, 100.0])
 def test_momentum_of_coarse_schemes_under_strong_friction(h_gamma):
     """After the last half of a kick it is (x / 2) coth(x / 2) times what a constant

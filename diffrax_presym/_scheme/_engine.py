@@ -19,6 +19,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from .. import _tree as tree
 from .._friction._linear import Effects
 from .._numbers import cast_to
 from .._system._bound import System
@@ -189,7 +190,7 @@ def _unless_amplified(system: System, span: Span, data: PyTree) -> PyTree:
     arrays, other = eqx.partition(system.friction, eqx.is_array)
     friction = eqx.combine(lax.stop_gradient(arrays), other)
     bad = friction.growth(span.t1, -span.h) > -math.log(friction.precision) / 2
-    return jtu.tree_map(lambda x: jnp.where(bad, jnp.nan, x), data)
+    return tree.invalid_if(bad, data)
 
 
 def forward(

@@ -8,9 +8,9 @@ import diffrax as dfx
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Bool, PyTree
 
+from .. import _tree as tree
 from .._numbers import State
 from .._results import _SUCCESSFUL, FRICTION_TOO_STRONG, NONFINITE
 from .._system._bound import System
@@ -30,9 +30,7 @@ def _is_too_strong(most: float, system: System, span: Span) -> Bool[Array, ""] |
 def unless_too_strong(most: float, system: System, span: Span, data: PyTree) -> PyTree:
     """What was prepared for a step, not finite if friction is too strong for it."""
     bad = _is_too_strong(most, system, span)
-    if bad is None:
-        return data
-    return jtu.tree_map(lambda x: jnp.where(bad, jnp.nan, x), data)
+    return data if bad is None else tree.invalid_if(bad, data)
 
 
 def explain(

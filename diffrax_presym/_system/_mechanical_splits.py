@@ -6,7 +6,6 @@ from typing import ClassVar, TYPE_CHECKING
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import PyTree
 
 from .. import _tree as tree
@@ -21,6 +20,12 @@ from ._split import AbstractSplit
 
 if TYPE_CHECKING:
     from ._bound import System
+
+
+# The most friction over a kick back in time. It amplifies the distance of a momentum
+# from that of the slow motion. By `friction_limit` of a "push" and a "move" the schemes
+# of order four and more resolve from 4.6 (`SofroniouSpaletta(8, Strang())`) to 8.8.
+_MOST_BACK = math.log(100)
 
 
 def _potential_force(system: "System", t: Time, y: State) -> PyTree:
@@ -68,13 +73,8 @@ class KineticSplit(AbstractSplit):
         def pushed(dp: PyTree, h: Time) -> PyTree:
             if friction is None:
                 return tree.add(dp, h, force)
-            # As in drifts, a stage back in time must not amplify rounding too much.
-            # Of a matrix nothing is known here but the time.
-            most, back = 1 / math.sqrt(friction.precision), as_time(h) < 0
-            data = jtu.tree_map(
-                lambda x: jnp.where(back & (x > most), jnp.nan, x),
-                friction.prepare(t, h, order),
-            )
+            bad = (as_time(h) < 0) & (friction.over(t, h) > _MOST_BACK)
+            data = tree.invalid_if(bad, friction.prepare(t, h, order))
             gained = friction.decay(data, tree.sum(p, dp))
             return tree.sum(dp, tree.sum(gained, friction.respond(data, force)))
 
