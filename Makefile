@@ -29,7 +29,7 @@ BENCHMARKS := against_loop compile_time schemes tuning work_precision choose_ste
 export MPLBACKEND ?= Agg
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow typed oldest lint format docs serve tutorials examples paper bench clean
+.PHONY: help demo test slow mutants typed oldest lint format docs serve tutorials examples paper bench clean
 # The targets share one environment, so they must not run in parallel.
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
@@ -48,16 +48,20 @@ test: $(VENV)/.with-tests  ## Run the tests, except the slow ones
 slow: $(VENV)/.with-tests  ## Run the slow tests
 	@$(BIN)/python $(PYTEST) -m slow $(if $(PART),--part $(PART))
 
-# By default the code of the documentation, which covers most features, and the loop over
-# stages, which relies on JAX internals. `make oldest TESTS=tests` runs all tests.
-# Deprecation warnings between old versions are ignored.
-# Annotations are checked at run time. Left out are tests that pass arguments of wrong
-# types on purpose.
+# Each of fifty errors is made in a copy of the package, which takes hours.
+# `make mutants ONLY="loop friction"` takes those with one of these words in their name.
+mutants: $(VENV)/.with-tests  ## Count the deliberate errors that the tests find
+	@$(BIN)/python tests/mutants.py $(ONLY)
+
+# Left out are tests that pass arguments of wrong types on purpose.
 typed: $(VENV)/.with-tests  ## Run tests with annotations checked at run time
 	@$(BIN)/python $(PYTEST) -m "not slow" -k "not bad_input" \
 		--jaxtyping-packages=diffrax_presym,beartype.beartype \
 		$(addprefix tests/test_,order.py friction.py wrappers.py diagnostics.py step_density.py)
 
+# By default the code of the documentation, which covers most features, and what is
+# private in Diffrax. `make oldest TESTS=tests` runs all tests. Deprecation warnings
+# between old versions are ignored.
 oldest: TESTS ?= tests/test_docs.py tests/test_diffrax_contract.py
 oldest: $(OLDEST)/.installed  ## Test the documentation with the oldest dependencies
 	@$(OLDEST)/bin/python $(PYTEST) -W ignore::DeprecationWarning $(TESTS)

@@ -72,12 +72,10 @@ class AbstractSplitting(AbstractPresymplecticSolver):
             enter = Enter()
             moves = [enter, *moves, inverse(enter)]
             spans = [(0, 0, 0), *spans, (1, 1, 0)]
+        scheme = Scheme(Stages(moves, spans), most_friction=most, pattern=pattern)
         if not first:
-            return Scheme(Stages(moves, spans), most_friction=most, pattern=pattern)
-        return Scheme(
-            Stages(moves, spans),
-            most_friction=most,
-            pattern=pattern,
+            return scheme
+        return scheme._replace(
             start=lambda system, t, y: first_force(system, kind, t, y),
             # Otherwise a kick is by a part of the force only.
             end_force=lambda carry: carry if "separable" in split.kinds else None,
