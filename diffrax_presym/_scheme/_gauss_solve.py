@@ -273,4 +273,8 @@ def contract(g, y: Slopes) -> Slopes:
 def factorise(g, y: Slopes) -> Slopes:
     """The same by a factorisation of the matrix."""
     operator = lx.FunctionLinearOperator(g, jax.eval_shape(lambda: y))
-    return lx.linear_solve(operator, y, lx.AutoLinearSolver(well_posed=True)).value
+    how = lx.AutoLinearSolver(well_posed=True)
+    solution = lx.linear_solve(operator, y, how, throw=False)
+    # One member of a batch must not end the others.
+    solved = solution.result == lx.RESULTS.successful
+    return jtu.tree_map(lambda x: jnp.where(solved, x, jnp.nan), solution.value)
