@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 import optax
+import optimistix as optx
 import pytest
 from helpers import assert_close, each, mixed_energy, Scheme, SCHEMES
 from jax.flatten_util import ravel_pytree
@@ -633,3 +634,27 @@ def test_the_branch_of_a_batch_that_is_not_taken():
     for deep, slope in zip((True, False), both, strict=True):
         exact = jax.grad(value, argnums=1)(deep, 1.3, CHECKPOINTED)
         np.testing.assert_allclose(slope, exact, rtol=1e-12)
+
+
+def test_an_equation_of_one_member_that_has_no_solution():
+    """The linear solve of the derivative of a root finder ends no other member."""
+    newton = optx.Newton(rtol=1e-10, atol=1e-10)
+
+    def loss(gamma):
+        sol = dfx.diffeqsolve(
+            dps.MechanicalSystem(
+                dps.QuadraticKinetic(),
+                lambda t, q, args: -jnp.cos(q),
+                dps.ConstantDamping(gamma),
+            ),
+            *(dps.PresymplecticGauss(1, newton), 0.0, 1.0, 0.1),
+            (jnp.asarray(1.5), jnp.asarray(0.0)),
+            adjoint=REVERSIBLE,
+            throw=False,
+        )
+        assert sol.ys is not None
+        return jnp.sum(sol.ys[0])
+
+    good, bad = jax.vmap(jax.grad(loss))(jnp.array([0.2, jnp.nan]))
+    np.testing.assert_allclose(good, jax.grad(loss)(0.2), rtol=1e-9)
+    assert jnp.isnan(bad)

@@ -272,9 +272,13 @@ def contract(g, y: Slopes) -> Slopes:
 
 def factorise(g, y: Slopes) -> Slopes:
     """The same by a factorisation of the matrix."""
-    operator = lx.FunctionLinearOperator(g, jax.eval_shape(lambda: y))
-    how = lx.AutoLinearSolver(well_posed=True)
-    solution = lx.linear_solve(operator, y, how, throw=False)
-    # One member of a batch must not end the others.
-    solved = solution.result == lx.RESULTS.successful
-    return jtu.tree_map(lambda x: jnp.where(solved, x, jnp.nan), solution.value)
+
+    def solve(g, b):
+        operator = lx.FunctionLinearOperator(g, jax.eval_shape(lambda: b))
+        how = lx.AutoLinearSolver(well_posed=True)
+        solution = lx.linear_solve(operator, b, how, throw=False)
+        solved = solution.result == lx.RESULTS.successful
+        return jtu.tree_map(lambda x: jnp.where(solved, x, jnp.nan), solution.value)
+
+    # Not differentiated by Lineax, whose errors would end all members of a batch.
+    return lax.custom_linear_solve(g, y, solve, transpose_solve=solve)
