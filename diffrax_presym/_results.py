@@ -32,11 +32,20 @@ FRICTION_TOO_STRONG = _entry(
 )
 NOT_CONVERGED = _entry(
     "fixed_point_not_converged",
-    "The fixed-point iteration of `PresymplecticGauss` did not converge in a step: the "
-    "step times the largest frequency of the system is too large. Take shorter steps, "
-    "or pass a root finder: `PresymplecticGauss(stages, optimistix.Newton(rtol, "
-    "atol))`. With `throw=False` the last time saved by `SaveAt(t1=True)` is that at "
-    "which the step started.",
+    "The fixed-point iteration of `PresymplecticGauss` did not converge in a step, or "
+    "left the finite numbers: the step times the largest frequency of the system is "
+    "too large, or its friction is strong. Take shorter steps, or pass a root finder: "
+    "`PresymplecticGauss(stages, optimistix.Newton(rtol, atol))`. With `throw=False` "
+    "the last finite time in `ts` of `SaveAt(steps=True)` is the end of that step.",
+)
+ROOT_NOT_FOUND = _entry(
+    "root_not_found",
+    "The root finder of `PresymplecticGauss` did not find the stages of a step: the "
+    "step is too long, they leave the domain of the energy, or the tolerances of the "
+    "root finder are below the rounding of the state. Take shorter steps, larger "
+    "tolerances `optimistix.Newton(rtol, atol)`, or a larger `max_iterations`. With "
+    "`throw=False` the last finite time in `ts` of `SaveAt(steps=True)` is the end of "
+    "that step.",
 )
 MULTISTEP_UNSTABLE = _entry(
     "multistep_unstable",

@@ -707,7 +707,7 @@ def test_masses_not_yet_known_are_not_judged():
 
 # A root that is not found gives an unsuccessful result.
 
-NOT_FOUND = "maximum number of steps was reached in the nonlinear solver"
+NOT_FOUND = "root finder of `PresymplecticGauss` did not find the stages"
 
 
 def hard_energy(t, q, p, args):

@@ -73,6 +73,18 @@ class EntryFriction(eqx.Module):
             each = jnp.minimum(each, jnp.abs(functools.reduce(jnp.add, rates) * h))
         return jnp.max(each, initial=0)
 
+    def strength(self, t: Time, h: Time) -> Scalar:
+        first, second = (increment(self.terms, t + x * h, h / 2) for x in (0.0, 0.5))
+        falls = (first > second) & (second > 0)
+        # After a singularity the rate falls like a power of time, which polynomials
+        # follow.
+        ratio = jnp.where(falls, second / jnp.where(falls, first, 1), 1)
+        both = jnp.where(falls, 2 * second * ratio**2, first + second)
+        return jnp.max(both, initial=0)
+
+    def scaled(self, factor: Scalar) -> "EntryFriction":
+        return EntryFriction(tuple((law, _times(factor, x)) for law, x in self.terms))
+
     def is_singular(self, t: Time) -> Bool[Array, ""] | None:
         return reduce_any([law.is_singular(t) for law, _ in self.terms])
 
@@ -131,8 +143,18 @@ class MatrixFriction(eqx.Module):
         column = jnp.sqrt(jnp.sum(symmetric**2, axis=-2))
         return jnp.max(column, initial=0) * jnp.abs(h)
 
+    def strength(self, t: Time, h: Time) -> Scalar:
+        return self.growth(t, h)
+
+    def scaled(self, factor: Scalar) -> "MatrixFriction":
+        return MatrixFriction(_times(factor, self.matrix))
+
     def is_singular(self, t: Time) -> None:
         return None
+
+
+def _times(factor: Scalar, x: Array) -> Array:
+    return cast_to(factor, x) * x
 
 
 def reduce_any(conditions: list[Bool[Array, ""] | None]) -> Bool[Array, ""] | None:

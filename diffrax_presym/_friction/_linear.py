@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, PyTree
 
-from .._numbers import Scalar, Time
+from .._numbers import as_time, Scalar, Time
 from ._leaf import EntryFriction, MatrixFriction, reduce_any
 
 
@@ -100,6 +100,19 @@ class LinearFriction(eqx.Module):
         momentum decays or grows, but no more than at the rate at the end. A momentum
         that obeys a force has no longer memory."""
         return functools.reduce(jnp.maximum, self._each("over", t, h))
+
+    def strength(self, t: Time, h: Time) -> Scalar:
+        """The logarithm of the factor by which friction that lasts makes momenta decay
+        over a span, in either direction."""
+        t, h = as_time(t), as_time(h)
+        first = jnp.minimum(t, t + h)
+        return functools.reduce(jnp.maximum, self._each("strength", first, jnp.abs(h)))
+
+    def scaled(self, factor: Scalar) -> "LinearFriction":
+        """A part of it."""
+        scale = lambda leaf: leaf.scaled(factor)
+        leaves = jtu.tree_map(scale, self.leaves, is_leaf=_is_leaf)
+        return LinearFriction(leaves, self.precision)
 
     def is_singular(self, t: Time) -> Bool[Array, ""] | None:
         """Whether it is infinite at `t`; `None` if it never is."""

@@ -57,12 +57,17 @@ class Collocation(AbstractMove):
         starts = jnp.concatenate([starts, t0 + nodes * h, repeat])
         lengths = jnp.concatenate([lengths, to_middle, -to_middle])
         friction = system.friction
+        # Frames that move with more of it grow exponentially over a step, which
+        # polynomials do not follow. The rest of it is part of the force.
+        limit, strength = min(1.0, self.number / 2), friction.strength(t0, h)
+        share = jnp.where(strength > limit, limit / jnp.maximum(strength, limit), 1)
+        friction = friction.scaled(share)
         decays = jax.vmap(lambda t, h: friction.prepare(t, h, 1))(starts, lengths)
         (effects,) = friction.fix([decays])
         rows = lambda rows: jtu.tree_map(lambda x: x[rows], effects)
         inwards, outwards = slice(3, 3 + len(nodes)), slice(3 + len(nodes), None)
         parts = map(rows, [0, 1, 2, inwards, outwards])
-        return Frames(*parts)
+        return Frames(*parts, share)
 
     def is_autonomous(self, system: System) -> bool:
         return system.prepares_once
@@ -156,6 +161,12 @@ class PresymplecticGauss(AbstractPresymplecticSolver):
     frequency of the system below about one to two. A step for which it does not
     converge fails with a `RESULTS`. For stiff energies pass a root finder.
 
+    Friction of more than 1 over a step, the rate times its length (1/2 for one stage),
+    is divided: the frame moves with that much of it, the rest is part of the force.
+    Order and symmetry are kept, and errors stay small for any strength, but the step is
+    no longer conformally symplectic to rounding, and from a strength of about 4 on it
+    needs a root finder.
+
     Derivatives are those of the implicit function, not of the iterations, in forward
     and in reverse mode; [`diffrax_presym.FixedStepAdjoint`][] takes gradients in
     constant memory.
@@ -221,9 +232,8 @@ class PresymplecticGauss(AbstractPresymplecticSolver):
         **Raises:**
 
         `ValueError` if a number is out of range, or `root_finder` of the wrong kind. A
-        step whose iteration does not converge makes the solve fail, with
-        `RESULTS.nonlinear_max_steps_reached`, or with `RESULTS.nonlinear_divergence` if
-        it leaves the finite numbers.
+        step whose iteration does not converge, or leaves the finite numbers, makes the
+        solve fail with a result whose message says what to change.
         """
         _check_number(stages, MAX_STAGES, "`PresymplecticGauss(stages)`")
         if root_finder is not None:

@@ -16,7 +16,8 @@ from jaxtyping import Array, Inexact, PyTree, Shaped
 
 from .. import _tree as tree
 from .._friction._linear import Effects
-from .._numbers import cast_to, State
+from .._numbers import cast_to, Scalar, State
+from .._results import NOT_CONVERGED, ROOT_NOT_FOUND
 from .._system._bound import System
 from ._collocation import gauss_table
 from ._engine import Span
@@ -37,6 +38,7 @@ class Frames(NamedTuple):
     whole: Effects
     inwards: Effects  # from each stage to the middle
     outwards: Effects  # from the middle to each stage
+    share: Scalar  # of the friction that the frames move with
 
 
 class GaussStep(eqx.Module):
@@ -60,11 +62,16 @@ class GaussStep(eqx.Module):
         table, t0, h = gauss_table(number), span.t0, span.h
         both = (None, None) if frames is None else (frames.outwards, frames.inwards)
         self.number, self.h, self.base, self.base_lost = number, h, base, base_lost
+        rest = None
+        if frames is not None and system.friction is not None:
+            rest = system.friction.scaled(1 - frames.share)
 
         def one(t, weight, both, q, p):
             outwards, inwards = both
             p = system.move_frame(outwards, p)
             velocity, force = system.velocity_and_force(t, (q, p))
+            if rest is not None:
+                force = rest.net_force(t, force, p)
             return tree.scale(weight, (velocity, system.move_frame(inwards, force)))
 
         def slopes(stages: Stages) -> Slopes:
@@ -122,23 +129,26 @@ class _Search(NamedTuple):
     slopes: Slopes
     # One array, as XLA would make a kernel for each number. Changes are those of the
     # stages, in units of their rounding.
-    record: Inexact[Array, "7"]
+    record: Inexact[Array, " numbers"]
 
 
-# The entries of the record.
+# The entries of the record, followed by the last change of each leaf, as it is.
 _STATUS = 0  # of the search, one of the following
-_GOING, _CONVERGED, _FAILED = 0, 1, 2
+_GOING, _PROBING, _CONVERGED, _FAILED = 0, 1, 2, 3
 _COUNT = 1  # of iterations
 _LAST, _BEFORE = 2, 3  # change, and the one before
 _LEAST = 4  # change so far
 _STALLED = 5  # consecutive iterations without a smaller change
 _FRESH = 6  # whether it was restarted without a guess
+_LEAVES = 7
 
 
 # Largest estimated change of another iteration, in units of rounding, to stop.
 _NEGLIGIBLE = 1e-3
 # Largest change at which stagnation is attributed to rounding.
 _ROUNDING = 16.0
+# Size of the perturbation that probes how rounding is amplified.
+_PROBE = 4.0
 
 
 def fixed_point(max_iterations: int, tolerance: float, step: GaussStep, guess: Slopes):
@@ -146,61 +156,82 @@ def fixed_point(max_iterations: int, tolerance: float, step: GaussStep, guess: S
 
     It stops when its changes no longer decrease. The remaining error is rounding, of
     either sign; that of a larger tolerance breaks the symmetry.
+
+    Rounding of one leaf may change another by more than its own rounding, such as the
+    momentum of a spring at rest far from the origin. Where changes stagnate at a higher
+    level, stages are perturbed by a few roundings. A change that this does not alter is
+    no effect of rounding, and the iteration goes on.
     """
     dtype = step.h.dtype
     number = lambda x: jnp.asarray(x, dtype)
     nothing = jtu.tree_map(jnp.zeros_like, guess)
     eps = float(jnp.finfo(_lowest(guess)).eps)
-    loose, negligible = eps ** (-1 / 3), max(_NEGLIGIBLE, tolerance / eps)
+    negligible = max(_NEGLIGIBLE, tolerance / eps)
 
     def iterate(search: _Search) -> _Search:
-        _, count, last, before, least, stalled, fresh = search.record
+        status, count, last, before, least, stalled, fresh = search.record[:_LEAVES]
+        probing = status == _PROBING
         slopes = step.slopes(search.stages)
         stages = step.stages(slopes)
-        q, p = (_change(*x, dtype) for x in zip(stages, search.stages, strict=True))
-        change = jnp.maximum(q, p)
-        # Positions and momenta may each depend on the other alone, so that changes
-        # decrease over two iterations.
+        changes, units = _changes(stages, search.stages, dtype)
+        change = jnp.max(changes / units)
+        # Positions and momenta may each depend on the other alone, so that they change
+        # alternately. Only two changes together say how far the iteration is.
         rate = jnp.maximum(change / last, last / before)
         stalled = jnp.where(change < least, 0, stalled + 1)
-        # A component that is at rest changes by rounding alone.
+        # Of the last change, if that was probed.
+        known = search.record[_LEAVES:]
+        altered = jnp.abs(changes - known) >= known / 2
+        rounding = jnp.all(altered | (known <= _ROUNDING * units))
         converged = (
             (change == 0)
             | (rate * change <= negligible)
-            | ((stalled > 0) & (change <= _ROUNDING))
-            | ((stalled >= 3) & (jnp.minimum(q, p) <= loose))
+            | ((stalled > 0) & (jnp.maximum(change, last) <= _ROUNDING))
+            | (probing & rounding)
         )
         # A guess may be outside of the domain although the state is inside.
         finite = jnp.isfinite(change)
         restart = ~finite & (fresh == 0)
-        failed = jnp.where(finite | restart, _GOING, _FAILED)
-        status = jnp.where(converged, _CONVERGED, failed)
+        probe = (stalled >= 3) & (change >= last) & finite & ~probing
+        stalled = jnp.where(probing, 0, stalled)
+        status = jnp.where(finite | restart, jnp.where(probe, 1, 0), _FAILED)
+        status = jnp.where(converged, _CONVERGED, status)
         least = jnp.minimum(change, least)
         start = lambda x, y: jtu.tree_map(lambda x, y: jnp.where(restart, x, y), x, y)
         record = start(
             [_GOING, count + 1, 0, 0, jnp.inf, 0, 1],
             [status, count + 1, change, last, least, stalled, fresh],
         )
-        record = jnp.stack([number(x) for x in record])
-        return _Search(start(step.stages(nothing), stages), slopes, record)
+        record = jnp.concatenate([jnp.stack([number(x) for x in record]), changes])
+        old = lambda x, y: tree.where(probing, x, y)
+        next = tree.where(probe, _perturbed(search.stages, count), stages)
+        next = start(step.stages(nothing), next)
+        return _Search(next, old(search.slopes, slopes), record)
 
     def going(search: _Search):
         record = search.record
-        return (record[_STATUS] == _GOING) & (record[_COUNT] < max_iterations)
+        return (record[_STATUS] <= _PROBING) & (record[_COUNT] < max_iterations)
 
-    record = np.zeros(7)
+    record = np.zeros(_LEAVES + len(jtu.tree_leaves(guess)))
     record[_LEAST] = np.inf
     search = _Search(step.stages(guess), guess, number(record))
     search = lax.while_loop(going, iterate, search)
-    status = search.record[_STATUS]
     results: Any = dfx.RESULTS
-    failure = results.where(
-        status == _FAILED,
-        results.nonlinear_divergence,
-        results.nonlinear_max_steps_reached,
-    )
-    converged = status == _CONVERGED
-    return search.slopes, results.where(converged, results.successful, failure)
+    converged = search.record[_STATUS] == _CONVERGED
+    return search.slopes, results.where(converged, results.successful, NOT_CONVERGED)
+
+
+def _perturbed(x: PyTree, count: Array) -> PyTree:
+    """Each entry changed by a few units of its rounding, of either sign."""
+
+    def leaf(x):
+        # Multiples of the golden ratio, modulo one: signs without a pattern.
+        index = lax.iota(jnp.uint32, x.size) + count.astype(jnp.uint32)
+        up = (index * jnp.uint32(2654435769) >> 31).reshape(x.shape).astype(bool)
+        size = _PROBE * float(jnp.finfo(x.dtype).eps)
+        return x * jnp.where(up, 1 + size, 1 - size).astype(x.dtype)
+
+    return jtu.tree_map(leaf, x)
 
 
 def by_root_finder(
@@ -216,7 +247,9 @@ def by_root_finder(
     residual = lambda slopes, _: step.residual(slopes)
     options = {"max_steps": max_steps, "throw": False}
     solution = optx.root_find(residual, root_finder, guess, **options)
-    return solution.value, dfx.RESULTS.promote(solution.result)
+    found = solution.result == optx.RESULTS.successful
+    results: Any = dfx.RESULTS
+    return solution.value, results.where(found, results.successful, ROOT_NOT_FOUND)
 
 
 def _lowest(x: PyTree):
@@ -225,16 +258,18 @@ def _lowest(x: PyTree):
     return max(dtypes, key=lambda dtype: float(jnp.finfo(dtype).eps))
 
 
-def _change(x: PyTree, y: PyTree, dtype) -> Inexact[Array, ""]:
-    """The largest difference, in units of the rounding of the largest entry."""
+def _changes(x: PyTree, y: PyTree, dtype) -> tuple[Array, Array]:
+    """The largest difference of each leaf, and the rounding of its largest entry."""
 
     def leaf(x, y):
         info = jnp.finfo(x.dtype)
-        size = float(info.eps) * jnp.max(jnp.abs(x), initial=0)
+        unit = float(info.eps) * jnp.max(jnp.abs(x), initial=0)
         change = jnp.max(jnp.abs(x - y), initial=0)
-        return (change / jnp.maximum(size, float(info.tiny))).astype(dtype)
+        return change.astype(dtype), jnp.maximum(unit, float(info.tiny)).astype(dtype)
 
-    return jtu.tree_reduce(jnp.maximum, jtu.tree_map(leaf, x, y), jnp.zeros((), dtype))
+    pairs = map(leaf, jtu.tree_leaves(x), jtu.tree_leaves(y))
+    changes, units = map(jnp.stack, zip(*pairs, strict=True))
+    return changes, units
 
 
 def contract(g, y: Slopes) -> Slopes:
@@ -243,28 +278,23 @@ def contract(g, y: Slopes) -> Slopes:
     def solve(g, b):
         # x = x + g(x) - b
         def iterate(state):
-            x, _, least, stalled, count = state
+            x, _, _, least, stalled, count = state
             new = tree.sub(tree.sum(x, g(x)), b)
-            change, size = tree.largest(tree.sub(new, x)), tree.largest(new)
+            change = jnp.max(jnp.divide(*_changes(new, x, least.dtype)))
             stalled = jnp.where(change < least, 0, stalled + 1)
-            # A contraction that rotates may grow for some iterations.
-            going = (change > eps / 8 * size) & (stalled < 10)
-            return new, going, jnp.minimum(change, least), stalled, count + 1
+            return new, change, state[1], jnp.minimum(change, least), stalled, count + 1
 
-        start = tree.scale(-1, b)
-        eps = float(jnp.finfo(_lowest(b)).eps)
-        state = (
-            start,
-            jnp.array(True),
-            jnp.asarray(jnp.inf, tree.largest(b).dtype),
-            jnp.asarray(0),
-            jnp.asarray(0),
-        )
-        x, going, least, *_ = lax.while_loop(
-            lambda state: state[1] & (state[-1] < 200), iterate, state
-        )
-        # Never numbers as if nothing had happened.
-        solved = ~going & (least <= eps ** (1 / 2) * tree.largest(x))
+        def going(state):
+            # A contraction that rotates may grow for some iterations.
+            _, change, _, _, stalled, count = state
+            return ~(change <= 1 / 8) & (stalled < 10) & (count < 200)
+
+        many = jnp.asarray(jnp.inf, tree.largest(b).dtype)
+        start = (tree.scale(-1, b), many, many, many, jnp.asarray(0), jnp.asarray(0))
+        x, change, last, *_ = lax.while_loop(going, iterate, start)
+        # Never numbers as if nothing had happened. Parts may change alternately.
+        small = float(jnp.finfo(_lowest(b)).eps) ** (-1 / 2)
+        solved = (change <= 1 / 8) | (jnp.maximum(change, last) <= small)
         return jtu.tree_map(lambda x: jnp.where(solved, x, jnp.nan), x)
 
     return lax.custom_linear_solve(g, y, solve, transpose_solve=solve)
