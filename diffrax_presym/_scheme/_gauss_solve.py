@@ -129,26 +129,24 @@ class _Search(NamedTuple):
     slopes: Slopes
     # One array, as XLA would make a kernel for each number. Changes are those of the
     # stages, in units of their rounding.
-    record: Inexact[Array, " numbers"]
+    record: Inexact[Array, "9"]
 
 
-# The entries of the record, followed by the last change of each leaf, as it is.
+# The entries of the record.
 _STATUS = 0  # of the search, one of the following
-_GOING, _PROBING, _CONVERGED, _FAILED = 0, 1, 2, 3
+_GOING, _CONVERGED, _FAILED = 0, 1, 2
 _COUNT = 1  # of iterations
 _LAST, _BEFORE = 2, 3  # change, and the one before
 _LEAST = 4  # change so far
 _STALLED = 5  # consecutive iterations without a smaller change
 _FRESH = 6  # whether it was restarted without a guess
-_LEAVES = 7
+_POSITIONS, _MOMENTA = 7, 8  # last change of each, by the rounding of its largest entry
 
 
 # Largest estimated change of another iteration, in units of rounding, to stop.
 _NEGLIGIBLE = 1e-3
 # Largest change at which stagnation is attributed to rounding.
 _ROUNDING = 16.0
-# Size of the perturbation that probes how rounding is amplified.
-_PROBE = 4.0
 
 
 def fixed_point(max_iterations: int, tolerance: float, step: GaussStep, guess: Slopes):
@@ -157,10 +155,10 @@ def fixed_point(max_iterations: int, tolerance: float, step: GaussStep, guess: S
     It stops when its changes no longer decrease. The remaining error is rounding, of
     either sign; that of a larger tolerance breaks the symmetry.
 
-    Rounding of one leaf may change another by more than its own rounding, such as the
-    momentum of a spring at rest far from the origin. Where changes stagnate at a higher
-    level, stages are perturbed by a few roundings. A change that this does not alter is
-    no effect of rounding, and the iteration goes on.
+    Rounding of a large entry may change a small one by more than its own rounding, such
+    as the momentum of a spring at rest far from the origin. Changes that stagnate are
+    therefore rounding too if positions, or momenta, are the same to the rounding of the
+    largest of them, in two iterations: these may change alternately.
     """
     dtype = step.h.dtype
     number = lambda x: jnp.asarray(x, dtype)
@@ -169,69 +167,48 @@ def fixed_point(max_iterations: int, tolerance: float, step: GaussStep, guess: S
     negligible = max(_NEGLIGIBLE, tolerance / eps)
 
     def iterate(search: _Search) -> _Search:
-        status, count, last, before, least, stalled, fresh = search.record[:_LEAVES]
-        probing = status == _PROBING
+        _, count, last, before, least, stalled, fresh, *both = search.record
         slopes = step.slopes(search.stages)
         stages = step.stages(slopes)
-        changes, units = _changes(stages, search.stages, dtype)
-        change = jnp.max(changes / units)
-        # Positions and momenta may each depend on the other alone, so that they change
-        # alternately. Only two changes together say how far the iteration is.
+        change = _change(stages, search.stages, dtype)
+        moved = [
+            (tree.largest(tree.sub(x, y)) / (eps * tree.largest(x))).astype(dtype)
+            for x, y in zip(stages, search.stages, strict=True)
+        ]
         rate = jnp.maximum(change / last, last / before)
         stalled = jnp.where(change < least, 0, stalled + 1)
-        # Of the last change, if that was probed.
-        known = search.record[_LEAVES:]
-        altered = jnp.abs(changes - known) >= known / 2
-        rounding = jnp.all(altered | (known <= _ROUNDING * units))
+        settled = jnp.minimum(*map(jnp.maximum, moved, both)) <= 1
         converged = (
             (change == 0)
             | (rate * change <= negligible)
             | ((stalled > 0) & (jnp.maximum(change, last) <= _ROUNDING))
-            | (probing & rounding)
+            | ((stalled >= 3) & settled)
         )
         # A guess may be outside of the domain although the state is inside.
         finite = jnp.isfinite(change)
         restart = ~finite & (fresh == 0)
-        probe = (stalled >= 3) & (change >= last) & finite & ~probing
-        stalled = jnp.where(probing, 0, stalled)
-        status = jnp.where(finite | restart, jnp.where(probe, 1, 0), _FAILED)
-        status = jnp.where(converged, _CONVERGED, status)
+        failed = jnp.where(finite | restart, _GOING, _FAILED)
+        status = jnp.where(converged, _CONVERGED, failed)
         least = jnp.minimum(change, least)
         start = lambda x, y: jtu.tree_map(lambda x, y: jnp.where(restart, x, y), x, y)
         record = start(
-            [_GOING, count + 1, 0, 0, jnp.inf, 0, 1],
-            [status, count + 1, change, last, least, stalled, fresh],
+            [_GOING, count + 1, 0, 0, jnp.inf, 0, 1, jnp.inf, jnp.inf],
+            [status, count + 1, change, last, least, stalled, fresh, *moved],
         )
-        record = jnp.concatenate([jnp.stack([number(x) for x in record]), changes])
-        old = lambda x, y: tree.where(probing, x, y)
-        next = tree.where(probe, _perturbed(search.stages, count), stages)
-        next = start(step.stages(nothing), next)
-        return _Search(next, old(search.slopes, slopes), record)
+        record = jnp.stack([number(x) for x in record])
+        return _Search(start(step.stages(nothing), stages), slopes, record)
 
     def going(search: _Search):
         record = search.record
-        return (record[_STATUS] <= _PROBING) & (record[_COUNT] < max_iterations)
+        return (record[_STATUS] == _GOING) & (record[_COUNT] < max_iterations)
 
-    record = np.zeros(_LEAVES + len(jtu.tree_leaves(guess)))
-    record[_LEAST] = np.inf
+    record = np.zeros(9)
+    record[[_LEAST, _POSITIONS, _MOMENTA]] = np.inf
     search = _Search(step.stages(guess), guess, number(record))
     search = lax.while_loop(going, iterate, search)
     results: Any = dfx.RESULTS
     converged = search.record[_STATUS] == _CONVERGED
     return search.slopes, results.where(converged, results.successful, NOT_CONVERGED)
-
-
-def _perturbed(x: PyTree, count: Array) -> PyTree:
-    """Each entry changed by a few units of its rounding, of either sign."""
-
-    def leaf(x):
-        # Multiples of the golden ratio, modulo one: signs without a pattern.
-        index = lax.iota(jnp.uint32, x.size) + count.astype(jnp.uint32)
-        up = (index * jnp.uint32(2654435769) >> 31).reshape(x.shape).astype(bool)
-        size = _PROBE * float(jnp.finfo(x.dtype).eps)
-        return x * jnp.where(up, 1 + size, 1 - size).astype(x.dtype)
-
-    return jtu.tree_map(leaf, x)
 
 
 def by_root_finder(
@@ -258,18 +235,16 @@ def _lowest(x: PyTree):
     return max(dtypes, key=lambda dtype: float(jnp.finfo(dtype).eps))
 
 
-def _changes(x: PyTree, y: PyTree, dtype) -> tuple[Array, Array]:
-    """The largest difference of each leaf, and the rounding of its largest entry."""
+def _change(x: PyTree, y: PyTree, dtype) -> Inexact[Array, ""]:
+    """The largest difference, in units of rounding of the largest entry of a leaf."""
 
     def leaf(x, y):
         info = jnp.finfo(x.dtype)
-        unit = float(info.eps) * jnp.max(jnp.abs(x), initial=0)
+        size = float(info.eps) * jnp.max(jnp.abs(x), initial=0)
         change = jnp.max(jnp.abs(x - y), initial=0)
-        return change.astype(dtype), jnp.maximum(unit, float(info.tiny)).astype(dtype)
+        return (change / jnp.maximum(size, float(info.tiny))).astype(dtype)
 
-    pairs = map(leaf, jtu.tree_leaves(x), jtu.tree_leaves(y))
-    changes, units = map(jnp.stack, zip(*pairs, strict=True))
-    return changes, units
+    return jtu.tree_reduce(jnp.maximum, jtu.tree_map(leaf, x, y), jnp.zeros((), dtype))
 
 
 def contract(g, y: Slopes) -> Slopes:
@@ -280,7 +255,7 @@ def contract(g, y: Slopes) -> Slopes:
         def iterate(state):
             x, _, _, least, stalled, count = state
             new = tree.sub(tree.sum(x, g(x)), b)
-            change = jnp.max(jnp.divide(*_changes(new, x, least.dtype)))
+            change = _change(new, x, least.dtype)
             stalled = jnp.where(change < least, 0, stalled + 1)
             return new, change, state[1], jnp.minimum(change, least), stalled, count + 1
 
