@@ -1,4 +1,6 @@
 # pyright: reportArgumentType=false, reportOptionalSubscript=false
+# pyright: reportOptionalMemberAccess=false, reportOptionalIterable=false
+# pyright: reportCallIssue=false
 """Steps of Gauss collocation that converge, fail, and are never wrong in silence."""
 
 import diffrax as dfx

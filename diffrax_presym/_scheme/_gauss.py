@@ -66,8 +66,8 @@ class Collocation(AbstractMove):
         (effects,) = friction.fix([decays])
         rows = lambda rows: jtu.tree_map(lambda x: x[rows], effects)
         inwards, outwards = slice(3, 3 + len(nodes)), slice(3 + len(nodes), None)
-        parts = map(rows, [0, 1, 2, inwards, outwards])
-        return Frames(*parts, share)
+        both = rows(inwards), rows(outwards)
+        return Frames(rows(0), rows(1), rows(2), *both, share)
 
     def is_autonomous(self, system: System) -> bool:
         return system.prepares_once
