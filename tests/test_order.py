@@ -84,8 +84,7 @@ def test_oscillator_errors_are_those_of_the_reference(scheme: Scheme, case):
 
 @few(OSCILLATORS, SCHEMES)
 def test_order_on_oscillators(scheme: Scheme, case):
-    # Eight steps per period or more, and so many that friction is resolved in each.
-    least = 8 if scheme.name.startswith("suzuki_yoshida_4") else 4
-    error = lambda n: oscillator_error(case, scheme, 10 / (least * n))
+    # At least eight steps per period.
+    error = lambda n: oscillator_error(case, scheme, 10 / (4 * n))
     order = measured_order(error, 10 * OSCILLATORS[case][-1])
     assert abs(order - scheme.order) < 0.15

@@ -68,9 +68,11 @@ class EntryFriction(eqx.Module):
     def over(self, t: Time, h: Time) -> Scalar:
         each = jnp.abs(increment(self.terms, t, h))
         if not self.is_autonomous:
-            end = jnp.maximum(t, t + h)
-            rates = [cast_to(rate, h) * law.rate(end) for law, rate in self.terms]
-            each = jnp.minimum(each, jnp.abs(functools.reduce(jnp.add, rates) * h))
+            rate = lambda t: functools.reduce(
+                jnp.add, [cast_to(x, h) * law.rate(t) for law, x in self.terms]
+            )
+            grows = rate(jnp.maximum(t, t + h)) >= rate(jnp.minimum(t, t + h))
+            each = jnp.where(grows, each, 0)
         return jnp.max(each, initial=0)
 
     def strength(self, t: Time, h: Time) -> Scalar:

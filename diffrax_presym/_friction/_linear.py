@@ -97,8 +97,8 @@ class LinearFriction(eqx.Module):
 
     def over(self, t: Time, h: Time) -> Scalar:
         """The largest friction over a span: the logarithm of the factor by which a
-        momentum decays or grows, but no more than at the rate at the end. A momentum
-        that obeys a force has no longer memory."""
+        momentum decays or grows. Friction that falls with time is strong for some steps
+        only, and is not counted."""
         return functools.reduce(jnp.maximum, self._each("over", t, h))
 
     def strength(self, t: Time, h: Time) -> Scalar:
