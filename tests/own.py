@@ -30,6 +30,8 @@ class CubicDrag(extend.AbstractFriction):
         one = jnp.ones(()) if mass is None else mass
 
         def leaf(p, m):
+            if m.ndim > p.ndim:
+                raise ValueError("Drag needs bodies. Write it as `force=f`.")
             m, h_ = m.astype(p.dtype), h.astype(p.dtype)
             x = 2 * self.c / m * jnp.sum((p / m) ** 2, axis=-1, keepdims=True) * h_
             return p * (1 / jnp.sqrt(1 + x) - 1)
