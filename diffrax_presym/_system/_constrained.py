@@ -1,0 +1,340 @@
+"""Mechanical systems with holonomic constraints."""
+
+from collections.abc import Callable
+from typing import ClassVar
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import lineax as lx
+from jaxtyping import Array, PyTree
+
+from .. import _tree as tree
+from .._checks import check_callable, describe
+from .._compositions import lengths
+from .._friction._base import AbstractFriction, Mechanics
+from .._numbers import as_time, Scalar, State, Time
+from .._results import _SUCCESSFUL, CONSTRAINT_NOT_SOLVED, NOT_REVERSIBLE
+from ._base import AbstractSystem, P, Q
+from ._bound import System
+from ._kinetic import QuadraticKinetic
+from ._mechanical import MechanicalSystem
+from ._multipliers import find_root, is_regular, LinearMap, Multipliers, solve
+from ._split import AbstractSplit
+
+
+class ConstrainedSystem(AbstractSystem):
+    r"""A mechanical system with holonomic constraints $g(t, q) = 0$,
+
+    $$q' = M^{-1} p, \qquad p' = F - \Gamma p - G^\top \lambda, \qquad
+    G = \frac{\partial g}{\partial q},$$
+
+    whose multipliers $\lambda$ keep $g$ and its rate of change
+    $G M^{-1} p + \partial g / \partial t$ zero, to rounding.
+
+    [`diffrax_presym.Strang`][] is then RATTLE (Andersen 1983): symmetric, of second
+    order, with exact friction, and conformally symplectic if that is one rate.
+    Compositions, `Suzuki4(Strang())` or `SofroniouSpaletta(6, Strang())`, are of higher
+    order; so are [`diffrax_presym.BlanesMoan4`][] and [`diffrax_presym.BlanesMoan6`][],
+    whose drifts are compositions, for expensive forces. Other schemes are refused.
+
+    A step whose multipliers are not found fails. Start from `system.project(t0, y0,
+    args)`. In Diffrax's loop save values between steps by `SaveAt(ts=ts,
+    fn=system.project)`.
+
+    !!! example
+
+        ```python
+        # A spherical pendulum in Cartesian coordinates.
+        weight = lambda t, q, args: 9.81 * q[2]
+        rod = lambda t, q, args: q @ q - 1.0
+        free = MechanicalSystem(QuadraticKinetic(), weight, ConstantDamping(0.1))
+        system = ConstrainedSystem(free, rod)
+        y0 = system.project(0.0, (jnp.array([0.6, 0.0, -0.8]), jnp.ones(3)))
+        sol = diffeqsolve(system, Strang(), t0=0.0, t1=10.0, dt0=0.01, y0=y0)
+        ```
+    """
+
+    system: MechanicalSystem
+    constraint: Callable
+    linear_solver: lx.AbstractLinearSolver | None
+    check_inverse: bool = eqx.field(static=True)
+    is_constrained: ClassVar[bool] = True
+    drift_is_autonomous: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        system: MechanicalSystem,
+        constraint: Callable,
+        *,
+        linear_solver: lx.AbstractLinearSolver | None = None,
+        check_inverse: bool = False,
+    ):
+        """**Arguments:**
+
+        - `system`: a [`diffrax_presym.MechanicalSystem`][] with a quadratic kinetic
+            energy, any friction, and forces that do not depend on the velocity
+            otherwise.
+        - `constraint`: a function `g(t, q, args)` that returns an array, zero where the
+            constraints hold, or a scalar.
+        - `linear_solver`: a Lineax solver for the multipliers. Defaults to `None`, by
+            their matrix. For a chain, in which constraints share coordinates with their
+            neighbours alone, the cost of `lineax.Tridiagonal()` is linear.
+        - `check_inverse`: whether steps are also inverted, and fail if that ends
+            elsewhere: for Monte Carlo methods. It doubles the cost. Defaults to
+            `False`.
+
+        **Raises:**
+
+        `ValueError` if any is of the wrong kind, if the system has a kinetic energy or
+        a force that is not supported, and when the solve is traced if the constraint
+        returns something else. A solve from a state that is off the constraint fails.
+        """
+        if not isinstance(system, MechanicalSystem):
+            raise ValueError(
+                "`ConstrainedSystem(system, constraint)` needs a `MechanicalSystem`, "
+                f"but got {type(system).__name__}. Write the constraint in Cartesian "
+                "coordinates, in which the mass is constant."
+            )
+        forced = system.external is not None
+        if forced or not isinstance(system.kinetic, QuadraticKinetic):
+            raise ValueError(
+                "`ConstrainedSystem` needs a mass, `QuadraticKinetic(mass)`, and no "
+                "`force=f` that depends on the velocity. Write a force of time and "
+                "place as `ForceField`, and friction as `friction=`."
+            )
+        check_callable(constraint, "constraint", "g(t, q, args)")
+        if not isinstance(linear_solver, lx.AbstractLinearSolver | None):
+            raise ValueError(
+                "`linear_solver` must be a Lineax solver such as "
+                f"`lineax.Tridiagonal()`, but got {linear_solver!r}."
+            )
+        self.system, self.constraint = system, constraint
+        self.linear_solver, self.check_inverse = linear_solver, check_inverse
+
+    # As the system without constraints.
+
+    @property
+    def laws(self) -> tuple[AbstractFriction, ...]:
+        return self.system.laws
+
+    @property
+    def mechanics(self) -> Mechanics:
+        return self.system.mechanics
+
+    def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
+        return self.system.energy(t, q, p, args)
+
+    def velocity(self, t: Time, q: Q, p: P, args: PyTree = None) -> Q:
+        return self.system.velocity(t, q, p, args)
+
+    # The constraint.
+
+    @property
+    def splits(self) -> tuple[AbstractSplit, ...]:
+        return (ConstrainedSplit(self.system.splits[0]),)
+
+    def value(self, t: Time, q: Q, args: PyTree) -> Multipliers:
+        """The constraints, as a vector."""
+        value = self.constraint(t, q, args)
+        leaves = jtu.tree_leaves(value)
+        dtype = jnp.result_type(*map(jnp.result_type, leaves)) if leaves else int
+        if len(leaves) != 1 or not jnp.issubdtype(dtype, jnp.floating):
+            raise ValueError(
+                "`constraint` must return a real array, with an entry for each "
+                f"constraint, but returned {describe(value)}. Use `jnp.stack`."
+            )
+        return jnp.ravel(leaves[0])
+
+    def rate(self, t: Time, q: Q, p: P, args: PyTree, flow: float = 1.0) -> Multipliers:
+        """The rate of change of the constraints at a momentum, or, if time does not
+        `flow`, that of a change of momentum."""
+        dt, v = jnp.full_like(t, flow), self.velocity(t, q, p, args)
+        value = lambda t, q: self.value(t, q, args)
+        return jax.jvp(value, (t, q), (dt, v))[1]
+
+    def normal(self, t: Time, q: Q, args: PyTree) -> Callable[[Multipliers], P]:
+        r"""The map from multipliers to momenta, $G^\top$."""
+        pull = jax.vjp(lambda q: self.value(t, q, args), q)[1]
+        return lambda x: pull(x)[0]
+
+    def _matrix(self, t: Time, q: Q, args: PyTree) -> LinearMap:
+        r"""The map $G M^{-1} G^\top$."""
+        normal = self.normal(t, q, args)
+        return lambda x: self.rate(t, q, normal(x), args, flow=0.0)
+
+    def to_tangent(self, t: Time, q: Q, p: P, args: PyTree, flow: float = 1.0) -> P:
+        """The change of a momentum that makes it tangential."""
+        return self._reaction(t, q, self.rate(t, q, p, args, flow), args)
+
+    def _reaction(self, t: Time, q: Q, miss: Multipliers, args: PyTree) -> P:
+        linear = self._matrix(t, q, args)
+        x = solve(linear, miss, self.linear_solver)
+        return tree.scale(-1, self.normal(t, q, args)(x))
+
+    def is_small(self, t: Time, q: Q, unit: Scalar, args: PyTree) -> Callable:
+        """Whether multipliers move positions by no more than rounding, to the power of
+        2/3, of a unit."""
+        normal, eps = self.normal(t, q, args), float(jnp.finfo(unit.dtype).eps)
+        move = lambda x: tree.largest(self.velocity(t, q, normal(x), args))
+        return lambda x: move(x) <= eps ** (2 / 3) * unit
+
+    def velocity_and_force(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> tuple[Q, P]:
+        t, friction = as_time(t), self.fit_friction(p)
+        v, force = self.system.velocity_and_force(t, q, p, args)
+        net = force if friction is None else friction.net_force(t, force, p)
+        rate, along = (
+            lambda t, q, p: self.rate(t, q, p, args),
+            (jnp.ones_like(t), v, net),
+        )
+        _, gained = jax.jvp(rate, (t, q, p), along)
+        return v, tree.sum(force, self._reaction(t, q, gained, args))
+
+    def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
+        return self.velocity_and_force(t, q, p, args)[1]
+
+    def violation(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
+        """The largest entry of the constraints and of their rates of change."""
+        t = as_time(t)
+        return tree.largest([self.value(t, q, args), self.rate(t, q, p, args)])
+
+    @eqx.filter_jit  # Outside of a solve, it would be compiled again by each call.
+    def project(self, t: Time, y: State, args: PyTree = None) -> State:
+        """The state with positions moved along $M^{-1} G^T$ until the constraints hold,
+        and the nearest momentum for which their rates of change are zero.
+
+        **Raises:**
+
+        `RuntimeError` if the constraints are redundant there, or the positions are too
+        far from them.
+        """
+        t, (q, p) = as_time(t), y
+        self.check_state(y)
+        normal = self.normal(t, q, args)
+        moved = lambda x: tree.sub(q, self.velocity(t, q, normal(x), args))
+        zero = jnp.zeros_like(self.value(t, q, args))
+        small = self.is_small(t, q, tree.largest(q), args)
+        regular = is_regular(self._matrix(t, q, args), zero, self.linear_solver)
+        miss = lambda x: self.value(t, moved(x), args)
+        x, found = find_root(miss, zero, small, self.linear_solver)
+        q = eqx.error_if(moved(x), ~regular, _REDUNDANT)
+        q = eqx.error_if(q, ~found, _TOO_FAR)
+        return q, tree.sum(p, self.to_tangent(t, q, p, args))
+
+
+_REDUNDANT = (
+    "The constraints are redundant: at this state their gradients are linearly "
+    "dependent. Omit those that follow from the others."
+)
+_TOO_FAR = (
+    "`project` did not find positions that satisfy the constraints. Start nearer to "
+    "them."
+)
+
+
+def _free(system: System) -> System:
+    """The system without constraints."""
+    return eqx.tree_at(lambda x: x.term, system, system.term.system)
+
+
+class ConstrainedSplit(AbstractSplit):
+    """The drift and the kick of a split, both on the constraint.
+
+    A drift starts with a momentum along the normals, so that it ends on the constraint.
+    It is symmetric, of second order, and composed to the order that is needed.
+    """
+
+    base: AbstractSplit
+    kinds: ClassVar[frozenset[str]] = frozenset({"any"})
+
+    def prepare(self, system, t, h, order) -> PyTree:
+        free, h = _free(system), lengths(order, h)
+        starts = t + jnp.cumsum(h) - h
+        prepare = jax.vmap(lambda t, h: self.base.prepare(free, t, h, order))
+        back = prepare(starts + h, -h) if system.term.check_inverse else None
+        return h, prepare(starts, h), back
+
+    def drift(self, system, t, h, data, y) -> State:
+        return self.attempt(system, t, h, data, y)[0]
+
+    def attempt(self, system, t, h, data, y) -> tuple[State, dfx.RESULTS]:
+        def stage(state, row):
+            (t, y, result), (h, data, back) = state, row
+            start = tree.values(y[0])
+            y, found = self._stage(system, t, h, data, y)
+            failure = dfx.RESULTS.where(found, _SUCCESSFUL, CONSTRAINT_NOT_SOLVED)
+            if system.term.check_inverse:
+                values = lax.stop_gradient(tree.values(y))
+                (end, _), found = self._stage(system, t + h, -h, back, values)
+                miss, unit = tree.largest(tree.sub(end, start)), tree.largest(end)
+                found &= miss <= float(jnp.finfo(unit.dtype).eps) ** (2 / 3) * unit
+                other = dfx.RESULTS.where(found, _SUCCESSFUL, NOT_REVERSIBLE)
+                failure = dfx.RESULTS.where(failure == _SUCCESSFUL, other, failure)
+            result = dfx.RESULTS.where(result == _SUCCESSFUL, failure, result)
+            return (t + h, y, result), None
+
+        success = jtu.tree_map(jnp.asarray, _SUCCESSFUL)
+        start, single = (t, y, success), len(data[0]) == 1
+        return lax.scan(stage, start, data, unroll=single)[0][1:]
+
+    def _stage(self, system, t, h, data, y) -> tuple[State, Array]:
+        term, free, args, q = system.term, _free(system), system.args, y[0]
+        q, normal = tree.values(q), term.normal(t, tree.values(q), args)
+        # The unknown are momenta times the length, which may be zero.
+        per_length = -1 / jnp.where(h == 0, 1, h)
+
+        def moved(x: Multipliers) -> State:
+            start = system.add(y, (None, tree.scale(per_length, normal(x))))
+            return self.base.drift(free, t, h, data, start)
+
+        like = jnp.zeros_like(term.value(t, q, args))
+        ahead = tree.values(moved(like)[0])
+        unit = jnp.maximum(tree.largest(q), tree.largest(ahead))
+        small = term.is_small(t, q, unit, args)
+        miss = lambda x: term.value(t + h, tree.values(moved(x)[0]), args)
+        x, found = find_root(miss, like, small, term.linear_solver)
+        y = moved(x)
+        change = term.to_tangent(t + h, *tree.values(y), args)
+        return system.add(y, (None, change)), found
+
+    def force(self, system, t, y) -> PyTree:
+        force, (q, _) = self.base.force(_free(system), t, y), tree.values(y)
+        if not self._is_plain:
+            return force
+        change = system.term.to_tangent(t, q, force, system.args, flow=0.0)
+        return tree.sum(force, change)
+
+    @property
+    def _is_plain(self) -> bool:
+        """Whether a kick is by a force alone."""
+        return "separable" in self.base.kinds
+
+    def kick(self, system, t, h, y, force, order) -> State:
+        if self._is_plain:
+            return self.base.kick(_free(system), t, h, y, force, order)
+        stage = lambda y, h: (self._kick_stage(system, t, h, y, force, order), None)
+        return lax.scan(stage, y, lengths(order, h))[0]
+
+    def _kick_stage(self, system, t, h, y, force, order) -> State:
+        """A kick with friction: two halves, and the multipliers between them."""
+        term, free, args = system.term, _free(system), system.args
+        half = lambda y: self.base.kick(free, t, h / 2, y, force, order)
+        middle, (q, p) = half(y), tree.values(y)
+        normal = term.normal(t, q, args)
+
+        def pushed(x: Multipliers) -> State:
+            return half(system.add(middle, (None, tree.scale(-1, normal(x)))))
+
+        def rate(x: Multipliers) -> Multipliers:
+            return term.rate(t, q, tree.values(pushed(x))[1], args)
+
+        speeds = [term.velocity(t, q, x, args) for x in (p, tree.values(middle)[1])]
+        small = term.is_small(t, q, jnp.maximum(*map(tree.largest, speeds)), args)
+        like = jnp.zeros_like(term.value(t, q, args))
+        x, found = find_root(rate, like, small, term.linear_solver)
+        return tree.invalid_if(~found, pushed(x))

@@ -1,0 +1,244 @@
+"""Systems on manifolds whose free motion is known."""
+
+from collections.abc import Callable
+from typing import ClassVar
+
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, PyTree
+
+from .. import _tree as tree
+from .._checks import describe, match
+from .._compositions import lengths
+from .._forms import divide
+from .._friction._base import AbstractFriction, MASS, Mechanics
+from .._friction._damping import as_laws
+from .._friction._leaf import EntryFriction, MatrixFriction
+from .._numbers import cast_to, Scalar, State, Time
+from ._base import AbstractSystem, P, Q
+from ._bound import System
+from ._manifolds import AbstractManifold
+from ._potential import AbstractPotential, as_potential, ForceField
+from ._split import AbstractSplit
+
+
+_is_manifold = lambda x: isinstance(x, AbstractManifold)
+
+
+class ManifoldSystem(AbstractSystem):
+    r"""A mechanical system on a manifold whose free motion is known, with friction.
+
+    Positions are in ambient coordinates. Drifts are free motions along geodesics, which
+    friction at a rate shortens; other friction is composed with them. Kicks are
+    tangential. [`diffrax_presym.Strang`][], [`diffrax_presym.BlanesMoan4`][],
+    [`diffrax_presym.BlanesMoan6`][] and compositions keep their order, and positions
+    stay on the manifold to rounding. Start from `system.project(t0, y0)`. In Diffrax's
+    loop save values between steps by `SaveAt(ts=ts, fn=system.project)`.
+
+    !!! example
+
+        ```python
+        # A rigid body that floats: 7 positions and 6 momenta.
+        body = (Euclidean(mass=2.0), Attitude(jnp.array([1.0, 1.2, 2.0])))
+        weight = lambda t, q, args: q[0][2] + rotation_matrix(q[1])[2, 2]
+        system = ManifoldSystem(body, weight, ConstantDamping(0.1))
+        q0 = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
+        p0 = jnp.zeros(3), jnp.array([0.1, 1.0, 0.0])
+        sol = diffeqsolve(system, Strang(), t0=0.0, t1=9.0, dt0=0.01, y0=(q0, p0))
+        ```
+    """
+
+    manifold: PyTree[AbstractManifold]
+    potential: AbstractPotential
+    friction: tuple[AbstractFriction, ...] | None
+    is_constrained: ClassVar[bool] = True
+    drift_is_autonomous: ClassVar[bool] = True
+
+    def __init__(self, manifold, potential, friction=None):
+        """**Arguments:**
+
+        - `manifold`: where the positions are, such as [`diffrax_presym.Sphere`][]`()`,
+            or a pytree of manifolds for positions of that structure.
+        - `potential`: the potential energy, a function `V(t, q, args)` that returns a
+            scalar; or a [`diffrax_presym.ForceField`][] of forces on the momenta, and
+            torques along the axes of bodies.
+        - `friction`: a law of friction that depends on time alone, or a list. Of a
+            `Sphere` or a `Stiefel` one rate. Defaults to none.
+
+        **Raises:**
+
+        `ValueError` if any is of the wrong kind; and when the solve is traced, if a
+        state or what a function returns has the wrong shape.
+        """
+        leaves = jtu.tree_leaves(manifold, is_leaf=_is_manifold)
+        if not leaves or not all(map(_is_manifold, leaves)):
+            raise ValueError(
+                "`ManifoldSystem(manifold, ...)` needs a manifold such as `Sphere()`, "
+                f"or a pytree of manifolds, but got {manifold!r}."
+            )
+        self.manifold, self.potential = manifold, as_potential(potential)
+        self.friction = as_laws(friction) or None
+        if any(self.parts[1:]):
+            raise ValueError(
+                "`ManifoldSystem` takes friction that depends on time alone. Write "
+                "`ConstantDamping(rate)` or `ViscousDamping(coefficients)`."
+            )
+
+    def map(self, fn: Callable, *trees: PyTree) -> PyTree:
+        """A function of each manifold and of parts of other trees."""
+        return jtu.tree_map(fn, self.manifold, *trees, is_leaf=_is_manifold)
+
+    def _each(self, method: str, *trees: PyTree) -> PyTree:
+        return self.map(lambda m, *x: getattr(m, method)(*x), *trees)
+
+    def pair(self, pairs: PyTree) -> State:
+        """A pair of trees from a tree of pairs."""
+        return self.map(lambda _, x: x[0], pairs), self.map(lambda _, x: x[1], pairs)
+
+    @property
+    def is_exact(self) -> bool:
+        return all(jtu.tree_leaves(self.map(lambda m: m.is_exact)))
+
+    @property
+    def is_free(self) -> bool:
+        return all(jtu.tree_leaves(self.map(lambda m: m.is_free)))
+
+    @property
+    def laws(self) -> tuple[AbstractFriction, ...]:
+        return self.friction or ()
+
+    @property
+    def mechanics(self) -> Mechanics:
+        return Mechanics(self.map(lambda m: m.mass))
+
+    @property
+    def splits(self) -> tuple[AbstractSplit, ...]:
+        return (ManifoldSplit(),)
+
+    def check_state(self, y: PyTree) -> None:
+        wanted = jtu.tree_structure(self.manifold, is_leaf=_is_manifold)
+        fits = type(y) is tuple and len(y) == 2
+        fits = fits and all(jtu.tree_structure(x) == wanted for x in y)
+        if fits:
+            manifolds = jtu.tree_leaves(self.manifold, is_leaf=_is_manifold)
+            rows = zip(manifolds, *map(jtu.tree_leaves, y), strict=True)
+            fits = all(m.momenta(jnp.shape(q)) == jnp.shape(p) for m, q, p in rows)
+        floating = lambda x: jnp.issubdtype(jnp.result_type(x), jnp.floating)
+        if not fits or not all(map(floating, jtu.tree_leaves(y))):
+            raise ValueError(
+                "The state must be a pair `(q, p)` of floating arrays for each "
+                "manifold of `ManifoldSystem`, of one shape, but for an `Attitude` "
+                f"quaternions and three momenta each. Got {describe(y)}. Write "
+                "`y0=(q0, p0)`."
+            )
+
+    def violation(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
+        """By how much a state is off the manifold, or its momentum not tangential."""
+        return tree.largest(tree.sub(self.project(t, (q, p), args), (q, p)))
+
+    def project(self, t: Time, y: State, args: PyTree = None) -> State:
+        """A state on the manifold, from one near it, with a tangential momentum."""
+        self.check_state(y)
+        return self.pair(self._each("project", *y))
+
+    # The vector field.
+
+    def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
+        v = divide(self.mechanics.mass, p, MASS, "p")
+        with jax.numpy_dtype_promotion("standard"):
+            return tree.dot(p, v) / 2 + self.potential(t, q, args)
+
+    def velocity(self, t: Time, q: Q, p: P, args: PyTree = None) -> Q:
+        return self._free_rates(q, p)[0]
+
+    def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
+        return self.velocity_and_force(t, q, p, args)[1]
+
+    def velocity_and_force(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> tuple[Q, P]:
+        velocity, free = self._free_rates(q, p)
+        return velocity, tree.sum(free, self.kick(t, q, p, args))
+
+    def _free_rates(self, q: Q, p: P) -> State:
+        def rates(m: AbstractManifold, q: Array, p: Array):
+            zero, one = jnp.zeros((), p.dtype), jnp.ones((), p.dtype)
+            return jax.jvp(lambda s: m.flow(q, p, s), (zero,), (one,))[1]
+
+        return self.pair(self.map(rates, q, p))
+
+    def kick(self, t: Time, q: Q, p: P, args: PyTree) -> P:
+        """The rate of change of the momenta by the potential."""
+        if not isinstance(self.potential, ForceField):
+            return self._each("pull", q, self.potential.force(t, q, args))
+        force = match(self.potential.fn(t, q, args), p, "`force`", "`p`")
+        return self.map(lambda m, q, x: m.project(q, x)[1], q, force)
+
+
+class ManifoldSplit(AbstractSplit):
+    """The free motion, with friction, and tangential kicks."""
+
+    kinds: ClassVar[frozenset[str]] = frozenset({"any"})
+
+    def quadrature(self, system, order) -> int:
+        return 0 if system.friction is None or system.friction.is_known else order
+
+    def prepare(self, system, t, h, order) -> PyTree:
+        friction, shortens = system.friction, _only_shortens(system)
+        is_exact = system.term.is_exact and shortens
+        h = jnp.reshape(h, 1) if is_exact else lengths(order, h)
+        if friction is None:
+            return h, None
+        starts, prepare = (
+            t + jnp.cumsum(h) - h,
+            lambda t, h: friction.prepare(t, h, order),
+        )
+        halves = lambda t, h: (prepare(t, h / 2), prepare(t + h / 2, h / 2))
+        return h, jax.vmap(prepare if shortens else halves)(starts, h)
+
+    def drift(self, system, t, h, data, y) -> State:
+        def stage(y, row):
+            q, p = self._stage(system, *row, *tree.values(y))
+            return system.add(y, tree.sub((q, p), tree.values(y))), None
+
+        return lax.scan(stage, y, data, unroll=len(data[0]) == 1)[0]
+
+    def _stage(self, system, h, data, q, p) -> State:
+        term, friction = system.term, system.friction
+        if friction is None or not _only_shortens(system):
+            if friction is not None:
+                p = tree.sum(p, friction.decay(data[0], p))
+            flow = lambda m, q, p: m.flow(q, p, cast_to(h, p))
+            q, p = term.pair(term.map(flow, q, p))
+            return q, p if friction is None else tree.sum(p, friction.decay(data[1], p))
+        # Friction at a rate: a shorter time, and a slower motion.
+        flow = lambda m, q, p, effect: m.flow(q, p, cast_to(effect.carried, p))
+        q, p = term.pair(term.map(flow, q, p, data.leaves))
+        return q, tree.sum(p, friction.decay(data, p))
+
+    def force(self, system, t, y) -> PyTree:
+        return system.term.kick(t, *tree.values(y), system.args)
+
+
+def _only_shortens(system: System) -> bool:
+    """Whether friction is at one rate for each manifold, so that it changes how far a
+    motion goes and not where; `ValueError` if it has to be."""
+    if system.friction is None:
+        return True
+    is_number = lambda law, rate: law.shape == () and jnp.shape(rate) == ()
+    is_rate = lambda x: (
+        isinstance(x, EntryFriction) and all(is_number(*term) for term in x.terms)
+    )
+    is_friction = lambda x: isinstance(x, EntryFriction | MatrixFriction)
+    leaves = jtu.tree_leaves(system.friction.leaves, is_leaf=is_friction)
+    if all(map(is_rate, leaves)):
+        return True
+    if not system.term.is_free:
+        raise ValueError(
+            "Friction on a `Sphere` or a `Stiefel` must be at one rate. Write "
+            "`ConstantDamping(rate)` with a number, or a pytree of numbers for several "
+            "manifolds."
+        )
+    return False

@@ -1,0 +1,226 @@
+"""Manifolds whose free motion is known, in ambient coordinates."""
+
+import abc
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Inexact
+
+from .._checks import as_positive
+from .._numbers import cast_to
+
+
+Both = tuple[Array, Array]  # positions and momenta
+
+
+class AbstractManifold(eqx.Module):
+    """Where an array of positions is, and how it moves there without forces."""
+
+    # Whether `flow` is exact; otherwise it is symmetric, of second order.
+    is_exact: eqx.AbstractClassVar[bool]
+    # Whether any momentum is one of the manifold.
+    is_free: eqx.AbstractClassVar[bool]
+    # As of `QuadraticKinetic`.
+    mass: eqx.AbstractVar[Inexact[Array, "..."] | float]
+
+    @abc.abstractmethod
+    def flow(self, q: Array, p: Array, s: Array) -> Both:
+        """The free motion over a time `s`."""
+
+    @abc.abstractmethod
+    def pull(self, q: Array, force: Array) -> Array:
+        """The rate of change of the momentum by an ambient force, $-dV/dq$."""
+
+    @abc.abstractmethod
+    def project(self, q: Array, p: Array) -> Both:
+        """A state on the manifold, from one near it."""
+
+    def momenta(self, q: tuple[int, ...]) -> tuple[int, ...]:
+        """The shape of the momenta of positions of a shape. By default the same."""
+        return q
+
+
+class Euclidean(AbstractManifold):
+    """Flat space, as a factor of a product."""
+
+    mass: Inexact[Array, "..."]
+    is_exact: ClassVar[bool] = True
+    is_free: ClassVar[bool] = True
+
+    def __init__(self, mass=1.0):
+        """**Arguments:**
+
+        - `mass`: a number, or an array with as many dimensions as `p` that broadcasts
+            to it. Defaults to 1.
+        """
+        self.mass = as_positive(mass, "`Euclidean(mass)`")
+
+    def flow(self, q: Array, p: Array, s: Array) -> Both:
+        return q + s * p / cast_to(self.mass, p), p
+
+    def pull(self, q: Array, force: Array) -> Array:
+        return force
+
+    def project(self, q: Array, p: Array) -> Both:
+        return q, p
+
+
+def _inner(x: Array, y: Array) -> Array:
+    return jnp.sum(x * y, axis=-1, keepdims=True)
+
+
+def _size(x: Array) -> Array:
+    """The length of vectors, with a derivative where it is zero."""
+    square = _inner(x, x)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+
+
+def _sinc(x: Array) -> Array:
+    return jnp.sinc(x / jnp.pi)
+
+
+class Sphere(AbstractManifold):
+    """Vectors of length one, over the last axis."""
+
+    is_exact: ClassVar[bool] = True
+    is_free: ClassVar[bool] = False
+    mass: ClassVar[float] = 1.0
+
+    def flow(self, q: Array, p: Array, s: Array) -> Both:
+        speed = _size(p)
+        c, d = jnp.cos(s * speed), s * _sinc(s * speed)
+        return self.project(c * q + d * p, c * p - d * speed**2 * q)
+
+    def pull(self, q: Array, force: Array) -> Array:
+        return force - _inner(force, q) * q
+
+    def project(self, q: Array, p: Array) -> Both:
+        q = q / _size(q)
+        return q, self.pull(q, p)
+
+
+class Stiefel(AbstractManifold):
+    """Matrices whose columns are orthonormal, in the metric of the ambient space: with
+    as many rows as columns rotations, or reflections. The geodesics are those of
+    Edelman, Arias and Smith (1998), SIAM J. Matrix Anal. Appl. 20, 303.
+    """
+
+    is_exact: ClassVar[bool] = True
+    is_free: ClassVar[bool] = False
+    mass: ClassVar[float] = 1.0
+
+    def flow(self, q: Array, p: Array, s: Array) -> Both:
+        expm, a, k = jax.scipy.linalg.expm, q.T @ p, q.shape[1]
+        a = (a - a.T) / 2
+        if q.shape[0] == k:
+            q = q @ expm(s * a)
+            p = q @ a
+        else:
+            row = jnp.concatenate([a, -p.T @ p], axis=1)
+            other = jnp.concatenate([jnp.eye(k, dtype=q.dtype), a], axis=1)
+            both = jnp.concatenate([q, p], axis=1)
+            both = both @ expm(s * jnp.concatenate([row, other]))
+            back = expm(-s * a)
+            q, p = both[:, :k] @ back, both[:, k:] @ back
+        # A step of Newton's method, as they are orthonormal but for rounding.
+        q = q @ (3 * jnp.eye(k, dtype=q.dtype) - q.T @ q) / 2
+        return q, self.pull(q, p)
+
+    def pull(self, q: Array, force: Array) -> Array:
+        both = q.T @ force
+        return force - q @ (both + both.T) / 2
+
+    def project(self, q: Array, p: Array) -> Both:
+        q, r = jnp.linalg.qr(q)
+        q = q * jnp.sign(jnp.diagonal(r))[None]
+        return q, self.pull(q, p)
+
+
+def _multiply(x: Array, y: Array) -> Array:
+    """The product of quaternions."""
+    a, b, u, v = x[..., :1], y[..., :1], x[..., 1:], y[..., 1:]
+    vector = a * v + b * u + jnp.cross(u, v)
+    return jnp.concatenate([a * b - _inner(u, v), vector], axis=-1)
+
+
+class Attitude(AbstractManifold):
+    """The attitude of a rigid body: a quaternion of length one, over the last axis, the
+    real part first. Its momentum is the angular momentum along the principal axes of
+    the body, three numbers.
+
+    The free rotation is that of a symmetric body, which is exact, between what remains
+    about the first two axes; composed to the order of the scheme. A potential takes the
+    matrix, [`diffrax_presym.rotation_matrix`][]`(q)`.
+    """
+
+    inertia: Float[Array, "*bodies 3"]
+    is_exact: ClassVar[bool] = False
+    is_free: ClassVar[bool] = True
+
+    def __init__(self, inertia):
+        """**Arguments:**
+
+        - `inertia`: the three principal moments of inertia, positive; for several
+            bodies of shape `(n, 3)`. The closer the first two are, the more accurate.
+        """
+        self.inertia = as_positive(inertia, "`Attitude(inertia)`")
+        if jnp.shape(self.inertia)[-1:] != (3,):
+            raise ValueError(
+                "`Attitude(inertia)` needs three principal moments, but got the shape "
+                f"{jnp.shape(self.inertia)}. Diagonalise a matrix, `jnp.linalg.eigh`, "
+                "and write positions in the body along its eigenvectors."
+            )
+
+    @property
+    def mass(self) -> Inexact[Array, "..."]:
+        return self.inertia
+
+    def momenta(self, q: tuple[int, ...]) -> tuple[int, ...]:
+        return (*q[:-1], 3)
+
+    def flow(self, q: Array, p: Array, s: Array) -> Both:
+        inverse = jnp.broadcast_to(1 / cast_to(self.inertia, p), p.shape)
+        a, b, c = jnp.moveaxis(inverse, -1, 0)
+        mean, rest, zero = (a + b) / 2, (a - b) / 4, jnp.zeros_like(a)
+        first, second = (rest, zero, zero), (zero, -rest, zero)
+        rates = [first, second, (mean, mean, mean), (zero, zero, c - mean)]
+        rates = jnp.stack([jnp.stack(x, axis=-1) for x in (*rates, second, first)])
+
+        def turn(y: Both, rate: Array) -> tuple[Both, None]:
+            # The body about an axis, and with it the angular momentum the other way.
+            (q, p), angle = y, s * rate * y[1]
+            half = _size(angle) / 2
+            c, u = jnp.cos(half), angle / 2 * _sinc(half)
+            q = _multiply(q, jnp.concatenate([c, u], axis=-1))
+            moved = jnp.cross(u, p)
+            return (q, p + 2 * (jnp.cross(u, moved) - c * moved)), None
+
+        # A loop, as the same six times would take very long to compile.
+        return self.project(*lax.scan(turn, (q, p), rates)[0])
+
+    def pull(self, q: Array, force: Array) -> Array:
+        inverse = jnp.concatenate([q[..., :1], -q[..., 1:]], axis=-1)
+        return _multiply(inverse, force)[..., 1:] / 2
+
+    def project(self, q: Array, p: Array) -> Both:
+        return q / _size(q), p
+
+
+def rotation_matrix(q: Float[Array, "*bodies 4"]) -> Float[Array, "*bodies 3 3"]:
+    """The matrix of a quaternion, from the coordinates of a body to those of space: for
+    potentials of a [`diffrax_presym.Attitude`][].
+
+    **Arguments:**
+
+    - `q`: quaternions of length one, over the last axis, the real part first.
+    """
+    w, x, y, z = jnp.moveaxis(q, -1, 0)
+    rows = [
+        [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)

@@ -1,0 +1,388 @@
+"""Rigid bodies, spheres and orthonormal matrices: beside SciPy on the equations in
+rotation matrices or with multipliers, and beside closed forms."""
+
+from functools import cache
+from typing import Any
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.spatial
+import scipy.special
+
+import diffrax_presym as dps
+
+
+diffeqsolve: Any = dfx.diffeqsolve
+rng = np.random.default_rng(0)
+INERTIA = np.array([1.0, 1.5, 2.5])
+DAMPERS = np.array([[0.3, 0.1, 0.0], [-0.1, 0.2, 0.0], [0.0, 0.1, 0.4]])
+ARM = np.array([0.3, 0.4, 0.2])
+Q = rng.standard_normal(4)
+L = np.array([0.3, -0.8, 0.6])
+FORM = np.diag([1.0, 2.0, 3.0, 5.0]) + 0.2
+MATRIX = rng.standard_normal((4, 2))
+SQUARE = rng.standard_normal((3, 3))
+
+
+def hat(w):
+    return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+
+
+def matrix(q):
+    """The rotation of a quaternion by SciPy, which has the real part last."""
+    last = np.concatenate([q[1:], q[:1]])
+    return scipy.spatial.transform.Rotation.from_quat(last).as_matrix()
+
+
+def body_rates(R, p, slope, gamma):
+    """Of the equations in matrices: with the derivative of the potential by them."""
+    omega = p / INERTIA
+    torque = [-np.sum(slope * (R @ hat(e))) for e in np.eye(3)]
+    return R @ hat(omega), np.cross(p, omega) + torque - gamma @ p
+
+
+def gravity(t):
+    return 1 + 0.2 * np.sin(t)
+
+
+def top_potential(t, q, args):
+    return (1 + 0.2 * jnp.sin(t)) * dps.rotation_matrix(q)[2, 2]
+
+
+def top_field(gamma):
+    def field(t, y):
+        R, p = y[:9].reshape(3, 3), y[9:]
+        slope = np.zeros((3, 3))
+        slope[2, 2] = gravity(t)
+        dR, dp = body_rates(R, p, slope, gamma)
+        return np.concatenate([np.ravel(dR), dp])
+
+    return field
+
+
+def floating_potential(t, q, args):
+    x, attitude = q
+    return jnp.sum((x + dps.rotation_matrix(attitude) @ ARM.astype(x.dtype)) ** 2)
+
+
+def floating_field(t, y):
+    x, R, px, p = y[:3], y[3:12].reshape(3, 3), y[12:15], y[15:]
+    tip = x + R @ ARM
+    dR, dp = body_rates(R, p, 2 * np.outer(tip, ARM), 0.3 * np.eye(3))
+    return np.concatenate([px / 2, np.ravel(dR), -2 * tip - 0.1 * px, dp])
+
+
+def orthonormal(gamma, slope, shape):
+    def field(t, y):
+        q, p = (x.reshape(shape) for x in np.split(y, 2))
+        force = -slope(q)
+        both = q.T @ force
+        tangential = force - q @ (both + both.T) / 2
+        rates = p, tangential - gamma(t) * p - q @ (p.T @ p)
+        return np.concatenate([np.ravel(x) for x in rates])
+
+    return field
+
+
+def form(t, q, args):
+    return jnp.sum(q * (FORM @ q)) / 2
+
+
+def trace(t, q, args):
+    return jnp.sum(q * SQUARE)
+
+
+# The system, a state near one of it, and its equations in NumPy.
+CASES = {
+    "top": (
+        dps.ManifoldSystem(
+            dps.Attitude(INERTIA), top_potential, dps.ViscousDamping(DAMPERS)
+        ),
+        *((Q, L), top_field(DAMPERS / INERTIA)),
+    ),
+    "top, one rate": (
+        dps.ManifoldSystem(
+            dps.Attitude(INERTIA), top_potential, dps.ConstantDamping(0.3)
+        ),
+        *((Q, L), top_field(0.3 * np.eye(3))),
+    ),
+    "floating body": (
+        dps.ManifoldSystem(
+            (dps.Euclidean(2.0), dps.Attitude(INERTIA)),
+            *(floating_potential, dps.ConstantDamping((0.1, 0.3))),
+        ),
+        *(((np.ones(3), Q), (L, 2 * L)), floating_field),
+    ),
+    "sphere": (
+        dps.ManifoldSystem(dps.Sphere(), form, dps.LogDamping(3.0, 1.0)),
+        (MATRIX[:, 0], MATRIX[:, 1]),
+        orthonormal(lambda t: 3 / (1 + t), lambda q: FORM @ q, (4, 1)),
+    ),
+    "Stiefel": (
+        dps.ManifoldSystem(dps.Stiefel(), form, dps.ConstantDamping(0.2)),
+        (MATRIX, MATRIX[::-1]),
+        orthonormal(lambda t: 0.2, lambda q: FORM @ q, (4, 2)),
+    ),
+    "rotations": (
+        dps.ManifoldSystem(dps.Stiefel(), trace, dps.ConstantDamping(0.2)),
+        (np.eye(3) + 0.2 * SQUARE, SQUARE.T),
+        orthonormal(lambda t: 0.2, lambda q: SQUARE, (3, 3)),
+    ),
+}
+SCHEMES = {
+    "Strang": (dps.Strang(), 2),
+    "Suzuki4": (dps.Suzuki4(dps.Strang()), 4),
+    "Blanes-Moan 4": (dps.BlanesMoan4(), 4),
+    "Blanes-Moan 6": (dps.BlanesMoan6(), 6),
+    "Compensated": (dps.Compensated(dps.Strang()), 2),
+}
+
+
+def start(case):
+    system, y0, _ = CASES[case]
+    return system.project(0.0, jax.tree.map(jnp.asarray, y0))
+
+
+def flat(case, y):
+    """A state as the equations in NumPy have it: quaternions as matrices."""
+    q, p = jax.tree.map(np.asarray, y)
+    if "top" in case:
+        q = matrix(q)
+    if case == "floating body":
+        q = q[0], matrix(q[1])
+    return np.concatenate([np.ravel(x) for x in jax.tree.leaves((q, p))])
+
+
+@cache
+def exact(case):
+    options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-13}
+    y0 = flat(case, start(case))
+    return scipy.integrate.solve_ivp(CASES[case][2], (0, 2), y0, **options).y[:, -1]
+
+
+def end(system, solver, y0, t1, steps, **options):
+    options = {"adjoint": dps.FixedStepAdjoint(), "max_steps": None} | options
+    args = (system, solver, 0.0, t1, t1 / steps, y0)
+    ys = jax.jit(lambda: diffeqsolve(*args, **options).ys)()
+    return jax.tree.map(lambda y: y[-1], ys)
+
+
+@pytest.mark.variants(4)
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_order(case, scheme):
+    system, (solver, claimed) = CASES[case][0], SCHEMES[scheme]
+    y0, errors = start(case), []
+    for steps in (8, 16, 32):
+        y = end(system, solver, y0, 2.0, steps)
+        errors.append(np.max(np.abs(flat(case, y) - exact(case))))
+        assert system.violation(2.0, *y) < 2e-15
+    errors = [e for e in errors if e > 2e-12]
+    order = np.log2(errors[0] / errors[-1]) / (len(errors) - 1)
+    assert -0.4 < order - claimed < 0.6, errors
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_step_is_undone(case):
+    system, solver, y0 = CASES[case][0], dps.BlanesMoan4(), start(case)
+    y1, *_ = solver.step(system, 0.0, 0.1, y0, None, None, False)
+    y2, *_ = solver.step(system, 0.1, 0.0, y1, None, None, False)
+    for x, y in zip(jax.tree.leaves(y0), jax.tree.leaves(y2), strict=True):
+        np.testing.assert_allclose(y, x, atol=4e-15)
+
+
+STEPS = [10_000, pytest.param(1_000_000, marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize("steps", STEPS)
+@pytest.mark.parametrize("case", ["top, one rate", "sphere", "Stiefel"])
+def test_states_stay_on_the_manifold(case, steps):
+    system = CASES[case][0]
+    system = dps.ManifoldSystem(system.manifold, system.potential)  # no friction
+    worst = lambda t, y, args: system.violation(t, *y)
+    t1 = steps * 0.01
+    violation = diffeqsolve(
+        *(system, dps.Strang(), 0.0, t1, 0.01, start(case)),
+        saveat=dfx.SaveAt(ts=jnp.linspace(0.0, t1, 101), fn=worst),
+        adjoint=dps.FixedStepAdjoint(),
+        max_steps=None,
+    ).ys
+    assert np.max(violation) < 3e-15
+
+
+# Closed forms.
+
+
+@pytest.mark.parametrize(
+    "periods", [100, pytest.param(100_000, marks=pytest.mark.slow)]
+)
+def test_free_body_beside_elliptic_functions(periods):
+    a, b, c = INERTIA
+    system = dps.ManifoldSystem(dps.Attitude(INERTIA), lambda t, q, args: 0.0 * q[0])
+    p0 = np.array([0.4, 0.0, 2.0])  # where the second entry is zero
+    energy, square = np.sum(p0**2 / INERTIA), np.sum(p0**2)
+    # About the third axis, Landau and Lifshitz, paragraph 37, for a < b < c.
+    omega = np.sqrt((c - b) * (square - energy * a) / (a * b * c))
+    m = (b - a) * (energy * c - square) / ((c - b) * (square - energy * a))
+    t1 = periods * 4 * scipy.special.ellipk(m) / omega + 0.7
+    sn, cn, dn, _ = scipy.special.ellipj(omega * 0.7, m)
+    sizes = np.sqrt(
+        [
+            a * (energy * c - square) / (c - a),
+            b * (energy * c - square) / (c - b),
+            c * (square - energy * a) / (c - a),
+        ]
+    )
+    wanted = sizes * [cn, sn, dn]
+    steps = int(np.ceil(t1 / 0.1))
+    y0 = jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.asarray(p0)
+    q, p = end(system, dps.BlanesMoan6(), y0, t1, steps)
+    np.testing.assert_allclose(p, wanted, atol=1e-13 * (10 + periods))
+    # The angular momentum in space does not change.
+    np.testing.assert_allclose(matrix(np.asarray(q)) @ p, p0, atol=1e-14 * (10 + steps))
+
+
+def test_smallest_eigenvectors():
+    n, k = 20, 3
+    frame = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    A = frame @ np.diag(np.linspace(1, 4, n)) @ frame.T
+    values, vectors = np.linalg.eigh(A)
+    objective = lambda t, q, args: jnp.sum(q * (A @ q)) / 2
+    friction = dps.ConstantDamping(0.5)
+    start = jnp.asarray(rng.standard_normal((n, k)))
+    sphere = dps.ManifoldSystem(dps.Sphere(), objective, friction)
+    y0 = sphere.project(0.0, (start[:, 0], jnp.zeros(n)))
+    q, _ = end(sphere, dps.Strang(), y0, 200.0, 500)
+    assert abs(objective(0.0, q, None) - values[0] / 2) < 1e-12
+    assert abs(abs(q @ vectors[:, 0]) - 1) < 1e-10
+    frames = dps.ManifoldSystem(dps.Stiefel(), objective, friction)
+    y0 = frames.project(0.0, (start, jnp.zeros((n, k))))
+    q, _ = end(frames, dps.Strang(), y0, 200.0, 500)
+    assert abs(objective(0.0, q, None) - np.sum(values[:k]) / 2) < 1e-10
+
+
+def test_torques_of_many_bodies_by_a_force_field():
+    inertia = np.stack([INERTIA, INERTIA[::-1]])
+    attitude = jnp.stack([jnp.asarray(Q), jnp.asarray(Q[::-1])])
+    slope = lambda t, q, args: -0.5 * jnp.tile(jnp.asarray(L), (2, 1))
+    many = dps.ManifoldSystem(dps.Attitude(inertia), dps.ForceField(slope))
+    y0 = many.project(0.0, (attitude, jnp.stack([jnp.asarray(L), -jnp.asarray(L)])))
+    q, p = end(many, dps.BlanesMoan4(), y0, 1.0, 10)
+    for i in range(2):
+        torque = dps.ForceField(lambda t, q, args: -0.5 * jnp.asarray(L))
+        one = dps.ManifoldSystem(dps.Attitude(inertia[i]), torque)
+        y = end(one, dps.BlanesMoan4(), jax.tree.map(lambda x, i=i: x[i], y0), 1.0, 10)
+        np.testing.assert_allclose(y[0], q[i], atol=1e-14)
+        np.testing.assert_allclose(y[1], p[i], atol=1e-14)
+
+
+# Gradients and what is saved.
+
+
+GRADIENTS = {
+    "reversal": dps.FixedStepAdjoint("reversal"),
+    "checkpoints": dps.FixedStepAdjoint("checkpoints"),
+    "Diffrax": dfx.RecursiveCheckpointAdjoint(),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("gradient", GRADIENTS)
+def test_gradient(case, gradient):
+    system, y0 = CASES[case][0], start(case)
+    solver, ts = dps.Suzuki4(dps.Strang()), jnp.array([0.13, 0.5, 1.0])
+
+    @jax.jit
+    def loss(x):
+        moved = jax.tree.map(lambda y: y * jnp.where(y > 0, x[0], 1.0), y0)
+        changed = jax.tree.map(lambda y: x[1] * y, system.friction)
+        new = dps.ManifoldSystem(system.manifold, system.potential, changed)
+        ys = diffeqsolve(
+            *(new, solver, 0.0, 1.0, 0.1, new.project(0.0, moved)),
+            saveat=dfx.SaveAt(ts=ts),
+            adjoint=GRADIENTS[gradient],
+            max_steps=16,
+        ).ys
+        return sum(jnp.sum(y**3 + y) for y in jax.tree.leaves(ys))
+
+    x, h = jnp.array([1.1, 0.9]), 1e-5
+    wanted = [(loss(x + h * e) - loss(x - h * e)) / (2 * h) for e in np.eye(2)]
+    np.testing.assert_allclose(jax.grad(loss)(x), wanted, rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_saved_values_are_on_the_manifold(case):
+    system, y0 = CASES[case][0], start(case)
+    ts = jnp.linspace(0.0, 1.0, 12)
+    solve = lambda **options: (
+        diffeqsolve(
+            *(system, dps.Suzuki4(dps.Strang()), 0.0, 1.0, 0.1, y0), **options
+        ).ys
+    )
+    ys = solve(saveat=dfx.SaveAt(ts=ts), adjoint=dps.FixedStepAdjoint())
+    projected = solve(saveat=dfx.SaveAt(ts=ts, fn=system.project))
+    for saved in (ys, projected):
+        assert np.max(jax.vmap(system.violation)(ts, *saved)) < 4e-15
+    both = zip(jax.tree.leaves(ys), jax.tree.leaves(projected), strict=True)
+    for x, y in both:
+        np.testing.assert_allclose(y, x, atol=1e-4)
+
+
+def test_single_precision():
+    system = CASES["floating body"][0]
+    cast = lambda x: jnp.asarray(x, jnp.float32)
+    arrays = jax.tree.map(cast, start("floating body"))
+    t0, t1 = jnp.float32(0.0), jnp.float32(2.0)
+    y = diffeqsolve(
+        *(system, dps.BlanesMoan4(), t0, t1, jnp.float32(0.1), arrays),
+        adjoint=dps.FixedStepAdjoint(),
+    ).ys
+    assert all(x.dtype == jnp.float32 for x in jax.tree.leaves(y))
+    y = flat("floating body", jax.tree.map(lambda x: x[-1], y))
+    np.testing.assert_allclose(y, exact("floating body"), atol=3e-5)
+
+
+# Errors.
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_an_initial_state_off_the_manifold(case):
+    system = CASES[case][0]
+    q, p = start(case)
+    y0 = jax.tree.map(lambda x: 1.01 * x, q), p
+    with pytest.raises(Exception, match=r"(?s)off the manifold.*system.project"):
+        diffeqsolve(system, dps.Strang(), 0.0, 1.0, 0.1, y0)
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [dps.PresymplecticLeapfrog(), dps.TunedRKN6(), dps.PresymplecticGauss(2)],
+    ids=lambda x: type(x).__name__,
+)
+def test_schemes_that_leave_the_manifold_refuse(solver):
+    with pytest.raises(ValueError, match=r"would leave the manifold.*Strang"):
+        diffeqsolve(CASES["top"][0], solver, 0.0, 1.0, 0.1, start("top"))
+
+
+def test_arguments():
+    flat = lambda t, q, args: 0.0 * jnp.sum(q)
+    with pytest.raises(ValueError, match=r"needs a manifold such as `Sphere\(\)`"):
+        dps.ManifoldSystem(dps.Sphere, flat)
+    with pytest.raises(ValueError, match="friction that depends on time alone"):
+        dps.ManifoldSystem(dps.Sphere(), flat, dps.PositionDamping(lambda t, q, a: 1.0))
+    with pytest.raises(ValueError, match="three principal moments"):
+        dps.Attitude(jnp.ones(2))
+    with pytest.raises(ValueError, match="must be positive"):
+        dps.Attitude(jnp.array([1.0, 0.0, 1.0]))
+    body = dps.ManifoldSystem(dps.Attitude(INERTIA), flat)
+    with pytest.raises(ValueError, match=r"The state must be a pair.*Write"):
+        body.project(0.0, (jnp.ones(4), jnp.ones(4)))
+    entries = dps.ConstantDamping(jnp.array([0.1, 0.2, 0.3]))
+    rough = dps.ManifoldSystem(dps.Sphere(), flat, entries)
+    y0 = jnp.array([1.0, 0.0, 0.0]), jnp.zeros(3)
+    with pytest.raises(ValueError, match="must be at one rate"):
+        diffeqsolve(rough, dps.Strang(), 0.0, 1.0, 0.1, y0)
