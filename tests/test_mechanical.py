@@ -378,7 +378,7 @@ MISTAKES = {
     "no coefficients": (lambda: dps.ViscousDamping(None), r"ViscousDamping\(1.0\)"),
     "rate by place": (lambda: dps.PositionDamping(NUMBER), r"ConstantDamping\(rate\)"),
     "unknown mass": (
-        lambda: dps.MechanicalSystem(UNKNOWN, harmonic, dps.ViscousDamping(C)),
+        lambda: dps.MechanicalSystem(UNKNOWN, harmonic, dps.Drag(0.1)),
         r"QuadraticKinetic\(mass\)",
     ),
     "force": (

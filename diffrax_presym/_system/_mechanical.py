@@ -40,10 +40,10 @@ class MechanicalSystem(AbstractSystem):
     | any other | `force` |
 
     The first two are linear, and exact in the drift: no scheme loses its order by them,
-    and in one-step schemes phase volume contracts exactly. With friction by place or by speed
-    use [`diffrax_presym.BlanesMoan4`][] or [`diffrax_presym.BlanesMoan6`][]. A `force`
-    that depends on the velocity has no exact flow: use
-    [`diffrax_presym.PresymplecticGauss`][].
+    and in one-step schemes phase volume contracts exactly. With the others use
+    [`diffrax_presym.BlanesMoan4`][] or [`diffrax_presym.BlanesMoan6`][]. A kick by a
+    `force` solves an equation for the momentum alone, to the order of the scheme and
+    symmetric; if the force is too stiff for the step, the solve fails.
 
     For a mass matrix that depends on the positions write
     [`diffrax_presym.LagrangianSystem`][], for any other energy
@@ -83,9 +83,9 @@ class MechanicalSystem(AbstractSystem):
             `eta(t)` is the integral of a rate of damping. Defaults to no friction.
         - `force`: any further force, a function `f(t, q, v, args)` of the velocity `v`,
             of the structure and shape of `q`: a motor, a controller, a contact. It is
-            added to that of the potential. Defaults to none. A force that does not
-            depend on the velocity is better part of the potential, or a
-            [`diffrax_presym.ForceField`][].
+            added to that of the potential. Above order 2 it is differentiated by `v` in
+            forward mode. Defaults to none. A force that does not depend on the velocity
+            is better part of the potential, or a [`diffrax_presym.ForceField`][].
 
         **Raises:**
 
@@ -108,7 +108,7 @@ class MechanicalSystem(AbstractSystem):
     def mechanics(self) -> Mechanics:
         if isinstance(self.kinetic, QuadraticKinetic):
             return Mechanics(self.kinetic.mass)
-        return Mechanics(has_mass=False)
+        return Mechanics(mass_varies=True)
 
     # The vector field.
 
@@ -145,7 +145,7 @@ class MechanicalSystem(AbstractSystem):
     def splits(self) -> tuple[AbstractSplit, ...]:
         parts = self.parts
         if self.external is not None or parts.forces:
-            return ()
+            return (KineticSplit(frozenset({"any"}), is_implicit=True),)
         if parts.local or parts.drags:
             return (KineticSplit(frozenset({"any"})),)
         kinetic = self.kinetic

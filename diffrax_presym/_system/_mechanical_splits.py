@@ -15,6 +15,8 @@ from .._friction._drag import Drag
 from .._friction._fit import fit_friction
 from .._friction._log_scale import Linear as LinearScale
 from .._numbers import as_time, State, Time
+from .._results import FORCE_NOT_SOLVED, NONFINITE
+from ._force_flow import force_flow
 from ._split import AbstractSplit
 
 
@@ -35,9 +37,14 @@ def _potential_force(system: "System", t: Time, y: State) -> PyTree:
 class KineticSplit(AbstractSplit):
     """The drift is the flow of the kinetic energy and of linear friction, the kick that
     of the potential and of friction that depends on place or speed: exact if that is
-    linear, otherwise a composition."""
+    linear, otherwise a composition. A kick by any force of the velocity is implicit."""
 
     kinds: frozenset[str] = eqx.field(static=True)
+    is_implicit: bool = eqx.field(static=True, default=False)
+
+    @property
+    def failure(self):
+        return FORCE_NOT_SOLVED if self.is_implicit else NONFINITE
 
     def quadrature(self, system, order) -> int:
         return 0 if system.term.kinetic.flow_is_known(system.friction) else order
@@ -52,17 +59,23 @@ class KineticSplit(AbstractSplit):
     def force(self, system, t, y) -> PyTree:
         """The force, and the other friction at the place if there is any."""
         force = _potential_force(system, t, y)
-        if "separable" in self.kinds:
+        if "separable" in self.kinds or self.is_implicit:
             return force
-        parts, at = system.term.parts, (t, tree.values(y)[0], system.args)
+        parts, at = system.parts, (t, tree.values(y)[0], system.args)
         forms = [part.at(*at) for part in parts.local]
         return force, forms, [drag.at(*at) for drag in parts.drags]
 
     def kick(self, system, t, h, y, force, order) -> State:
         if "separable" in self.kinds:
             return super().kick(system, t, h, y, force, order)
+        if self.is_implicit:
+            term, (q, p), args = system.term, tree.values(y), system.args
+            state = lambda p: (t, q, p, term.velocity(t, q, p, args), args)
+            total = lambda p: term.add_forces(force, term.external, *state(p))
+            dp, found = force_flow(total, h, p, order)
+            return system.add(y, (None, tree.invalid_if(~found, dp)))
         (force, forms, drags), p = force, tree.values(y)[1]
-        parts, mechanics = system.term.parts, system.term.mechanics
+        parts, mechanics = system.parts, system.term.mechanics
         pairs = zip(parts.local, forms, strict=True)
         linear = [
             Linear(LinearScale(), x, part.per_velocity, may_couple=True)

@@ -14,13 +14,15 @@ What a drift needs of time alone is prepared, for all stages of a step at once.
 """
 
 import abc
-from typing import ClassVar, TYPE_CHECKING
+from typing import Any, ClassVar, TYPE_CHECKING
 
+import diffrax as dfx
 import equinox as eqx
 from jaxtyping import PyTree
 
 from .. import _tree as tree
 from .._numbers import State, Time
+from .._results import NONFINITE
 
 
 if TYPE_CHECKING:
@@ -52,6 +54,12 @@ class AbstractSplit(eqx.Module):
 
     # What is different for some splits.
 
+    def attempt(
+        self, system: "System", t: Time, h: Time, data: PyTree, y: State
+    ) -> tuple[State, dfx.RESULTS | None]:
+        """The drift, and its result if it can fail. By default it cannot."""
+        return self.drift(system, t, h, data, y), None
+
     # What a kick and a drift do, and how a drift integrates, see `_strong_friction.py`.
     names: ClassVar[tuple[str, str]] = ("kick", "drift")
 
@@ -63,6 +71,8 @@ class AbstractSplit(eqx.Module):
         """What the drift from `t` to `t + h` needs of time alone. Nothing by
         default."""
         return None
+
+    failure: ClassVar[Any] = NONFINITE  # the reason if a state is not finite
 
     def kick(
         self, system: "System", t: Time, h: Time, y: State, force: PyTree, order: int

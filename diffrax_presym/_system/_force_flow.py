@@ -1,0 +1,93 @@
+"""The flow of a momentum alone, by forces that depend on it."""
+
+import functools
+import math
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Bool, PyTree
+
+from .. import _tree as tree
+from .._implicit import contract, implicit, largest_change
+from .._numbers import as_time, Time
+
+
+_Force = Callable[[PyTree], PyTree]  # of the momentum
+
+
+class _Equation(eqx.Module):
+    """The change of a momentum is a part from the start, and one from the end."""
+
+    p: PyTree
+    start: PyTree
+    end: _Force
+
+    def residual(self, change: PyTree) -> PyTree:
+        new = tree.sum(self.start, self.end(tree.sum(self.p, change)))
+        return tree.sub(new, change)
+
+
+def force_flow(
+    force: _Force, h: Time, p: PyTree, order: int
+) -> tuple[PyTree, Bool[Array, ""]]:
+    r"""The change of a momentum by a force over a length `h`, and whether it was found.
+
+    Of at least the given order, and symmetric: the length `-h` is the inverse. By
+    $p_1 - p_0 = \sum_j c_j h^j (g_0^{(j-1)} - (-1)^j g_1^{(j-1)})$ with $k$ derivatives
+    at both ends and the coefficients of the Padé approximation of the exponential, of
+    order $2 k$. Collocation would have more unknowns, and a guess that is worse.
+    """
+    k, h = (order + 1) // 2, as_time(h)
+    taylor = [h**j / math.factorial(j) for j in range(1, k + 1)]
+    pade = [math.comb(k, j) / math.comb(2 * k, j) * x for j, x in enumerate(taylor, 1)]
+    at_end = [(-1) ** j * x for j, x in enumerate(pade)]
+    series = lambda weights, x: functools.reduce(tree.sum, map(tree.scale, weights, x))
+    end = lambda p: series(at_end, _derivatives(force, p, k))
+    # Traced once, with all that it depends on, to be differentiated.
+    end, known = eqx.filter_closure_convert(end, p), _derivatives(force, p, k)
+    equation, guess = _Equation(p, series(pade, known), end), series(taylor, known)
+    return implicit(equation, guess, find=_iterate, tangent=contract)
+
+
+def _derivatives(force: _Force, p: PyTree, number: int) -> list[PyTree]:
+    """A force and its derivatives along the motion of the momentum by it."""
+
+    def along(fn: _Force, p: PyTree) -> PyTree:
+        _, change = jax.jvp(fn, (p,), (force(p),))
+        # Of a speed, at rest, it is not finite, and nothing else is known of it.
+        return jtu.tree_map(lambda x: jnp.where(jnp.isfinite(x), x, 0), change)
+
+    functions = [force]
+    for _ in range(number - 1):
+        functions.append(functools.partial(along, functions[-1]))
+    return [fn(p) for fn in functions]
+
+
+_NEGLIGIBLE = 1 / 8  # largest estimated change of another iteration to stop
+_ROUNDING = 16.0  # largest change at which stagnation is attributed to rounding
+_MOST = 128  # iterations
+
+
+def _iterate(equation: _Equation, guess: PyTree) -> tuple[PyTree, Bool[Array, ""]]:
+    """Fixed-point iteration to rounding: kicks are so short that it takes a few."""
+    first = jnp.full_like(tree.largest(guess), _ROUNDING)
+    end = lambda change: tree.sum(equation.p, change)
+
+    def iterate(state):
+        found, moved, _, count = state
+        new = tree.sum(found, equation.residual(found))
+        change = largest_change(end(new), end(found), first.dtype)
+        return new, change, moved, count + 1
+
+    def converged(state) -> Bool[Array, ""]:
+        _, moved, before, _ = state
+        stagnates = (moved < _ROUNDING) & (moved >= before)
+        return (moved * (moved / before) <= _NEGLIGIBLE) | stagnates
+
+    going = lambda x: ~converged(x) & jnp.isfinite(x[1]) & (x[3] < _MOST)
+    state = lax.while_loop(going, iterate, (guess, first, first, jnp.asarray(0)))
+    return state[0], converged(state)
