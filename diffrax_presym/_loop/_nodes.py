@@ -1,0 +1,148 @@
+"""Values between steps from the ends of several steps, at no stage of the scheme.
+
+Hermite interpolation of degree 11, from the states at the four ends of steps around a
+time, the nodes, and their first two derivatives along the motion.
+"""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from .. import _tree as tree
+from .._numbers import cast_to, State
+from .._scheme._base import Point, Scheme
+from .._system._bound import System
+from ._steps import Rows, Steps
+
+
+NODES = 4  # of a polynomial
+# The largest friction over a step. With more the motion decays faster than the
+# polynomial can follow.
+_MOST_FRICTION = 0.5
+# The largest ratio of neighbouring steps.
+_MOST_RATIO = 2.0
+
+# A state and its first two derivatives.
+Node = tuple[State, State, State]
+
+
+def derivatives(
+    scheme: Scheme, system: System, t: Array, side: Array, point: Point
+) -> Node:
+    """The state at a time of the solve, and its first two derivatives in that time:
+    where they jump, those before it (-1) or after it (1)."""
+    t = jnp.nextafter(t, t + cast_to(side, t))
+    y, force = system.values(point[0]), scheme.end_force(point[1])
+
+    def slope(t: Array, y: State, force: PyTree = None) -> State:
+        dy = system.slope(system.time(t), y, force)
+        return tree.scale(jnp.asarray(system.direction), dy)
+
+    first = slope(t, y, force)
+    return y, first, jax.jvp(slope, (t, y), (jnp.ones_like(t), first))[1]
+
+
+class Ways(eqx.Module):
+    """Whether values between steps are interpolated, or are shorter steps."""
+
+    interpolated: Bool[Array, ""]
+    # Whether they are so in any member of a batch, the same for all of them.
+    some: Bool[Array, ""]
+    others: Bool[Array, ""]  # whether any are not
+
+    def __init__(self, system: System, steps: Steps, last: Array):
+        yes = jnp.minimum(steps.fewest, last) >= NODES - 1
+        yes &= steps.ratio <= _MOST_RATIO
+        if system.friction is not None:
+            growth = lax.stop_gradient(steps.largest_growth(system, last))
+            yes &= growth <= _MOST_FRICTION
+        self.interpolated, self.some, self.others = (
+            yes,
+            tree.any_member(yes),
+            tree.any_member(~yes),
+        )
+
+
+class Stencils(eqx.Module):
+    """The nodes of each row, and their weights."""
+
+    first: Int[Array, " rows+1"]  # node; the last is never reached
+    weights: Float[Array, "rows nodes 3"]
+    ways: Ways
+
+    def __init__(self, steps: Steps, rows: Rows, last: Array, ways: Ways):
+        stop = jnp.maximum(rows.stop, 0)
+        begin = steps.time(stop)
+        low, high = steps.smooth_part(stop)
+        first = jnp.minimum(stop - NODES // 2, jnp.minimum(high, last) - NODES) + 1
+        first = jnp.maximum(first, low)
+        unit = steps.lengths(stop)
+        s = jnp.where(rows.inside, (rows.time - begin) / unit, 0)
+        if steps.ts is None:
+            s = s + (stop - first).astype(s.dtype)
+            nodes = [float(i) for i in range(NODES)]
+        else:
+            nodes = [(steps.time(first + i) - begin) / unit for i in range(NODES)]
+        self.weights = _weights(s, nodes, unit)
+        self.ways, due = ways, ways.some & rows.reached(last)
+        # A gap in measured times is saved at once, whatever it is.
+        first = jnp.where(rows.stop < 0, -NODES, jnp.where(due, first, last + 1))
+        self.first = jnp.append(first, last + 1)
+
+    @property
+    def last(self) -> Int[Array, " rows+1"]:
+        return self.first + NODES - 1
+
+    def known(self, rows: Rows) -> Int[Array, " rows"]:
+        """The number of steps after which each row is known."""
+        here = self.ways.interpolated & (rows.stop >= 0)
+        return jnp.where(here, self.last[:-1], rows.known)
+
+    def combine(self, j: Array, ring: Node) -> State:
+        """The state in row `j`, from a ring of nodes."""
+
+        def leaf(*data: Array) -> Array:
+            total = jnp.zeros(data[0].shape[1:], data[0].dtype)
+            for i in range(NODES):
+                for order, x in enumerate(data):
+                    weight = cast_to(self.weights[j, i, order], x)
+                    total = total + weight * x[(self.first[j] + i) % NODES]
+            return total
+
+        return jtu.tree_map(leaf, *ring)
+
+    def spread(self, j: Array, bar: State, ring: Node) -> Node:
+        """The transpose: the cotangents of the nodes, added to a ring of these."""
+        place = (jnp.arange(NODES) - self.first[j]) % NODES
+
+        def leaf(order: int, x: Array, bar: Array) -> Array:
+            weights = cast_to(self.weights[j, place, order], bar)
+            return x + weights.reshape(-1, *(1,) * bar.ndim) * bar[None]
+
+        one = lambda order: jtu.tree_map(lambda *x: leaf(order, *x), ring[order], bar)
+        return one(0), one(1), one(2)
+
+
+def _weights(s: Array, nodes: list, unit: Array) -> Array:
+    """The weights of value, first and second derivative at each node."""
+    weights = []
+    for i, node in enumerate(nodes):
+        others = nodes[:i] + nodes[i + 1 :]
+        inverse = [1 / (node - other) for other in others]
+        cube = math.prod((s - x) * c for x, c in zip(others, inverse, strict=True)) ** 3
+        # The Lagrange polynomial is 1 + a d + b d^2 + ..., with d the distance.
+        a, d = sum(inverse), s - node
+        b = (a * a - sum(c * c for c in inverse)) / 2
+        value = 1 + d * (d * (6 * a * a - 3 * b) - 3 * a)
+        each = (
+            value * cube,
+            d * (1 - 3 * a * d) * cube * unit,
+            (d * unit) ** 2 / 2 * cube,
+        )
+        weights.append(jnp.stack(each, axis=-1))
+    return jnp.stack(weights, axis=1)

@@ -1,0 +1,124 @@
+"""What a solve collects on its way, and at which steps."""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Int, PyTree
+
+from .. import _tree as tree
+from .._numbers import cast_to, State
+from .._scheme._base import Point
+from ._nodes import Node, NODES, Stencils
+
+
+class AbstractTrack(eqx.Module):
+    """Rows that are collected in order, at the starts of some steps.
+
+    The loop runs from one of these to the next, and asks nothing in between.
+    """
+
+    @abc.abstractmethod
+    def start(self) -> PyTree:
+        """The state before the first step."""
+
+    @abc.abstractmethod
+    def due(self, state: PyTree) -> Int[Array, ""]:
+        """The next step that is wanted."""
+
+    @abc.abstractmethod
+    def visit(self, state: PyTree, n: Array, point: Point) -> PyTree:
+        """The state after the start of that step."""
+
+    @abc.abstractmethod
+    def rows(self, state: PyTree) -> PyTree:
+        """What was collected."""
+
+
+class Track(AbstractTrack):
+    """Values at the starts of given steps."""
+
+    stops: Int[Array, " rows+1"]  # after those that are due one that is never reached
+    value: Callable[[Array, Point], PyTree]  # of the row and the state there
+    init: PyTree
+
+    def __init__(self, stops, is_due, never, value: Callable, init: PyTree):
+        self.stops = jnp.append(jnp.where(is_due, stops, never), never)
+        self.value, self.init = value, init
+
+    def start(self):
+        return jnp.zeros((), int), stack(self.init, len(self.stops) - 1)
+
+    def due(self, state):
+        return self.stops[state[0]]
+
+    def visit(self, state, n, point):
+        j, rows = state
+        return j + 1, put(rows, j, self.value(j, point))
+
+    def rows(self, state):
+        return state[1]
+
+
+class Interpolated(AbstractTrack):
+    """Values between steps, from the last few ends of steps."""
+
+    stencils: Stencils
+    kinks: Int[Array, " kinks"] | None  # the steps before which derivatives jump
+    node: Callable[[Array, Array, Point], Node]
+    value: Callable[[Array, State], PyTree]  # of the row and the state in it
+    y: State  # any
+    init: PyTree
+
+    def start(self):
+        ring = stack((self.y, self.y, self.y), NODES)
+        number = len(self.stencils.first) - 1
+        zero = jnp.zeros((), int)
+        return zero, zero, ring, stack(self.init, number), jnp.asarray(True)
+
+    def due(self, state):
+        n, j, *_ = state
+        return jnp.maximum(n, self.stencils.first[j])
+
+    def visit(self, state, n, point):
+        _, j, ring, rows, finite = state
+        kink = jnp.zeros((), int)
+        if self.kinks is not None:
+            kink = jnp.any(self.kinks == n).astype(int)
+        node = self.node(n, -kink, point)
+        ring = put(ring, n % NODES, node)
+
+        def save(x):
+            j, rows = x
+            y = self.stencils.combine(j, ring)
+            return j + 1, put(rows, j, self.value(j, y))
+
+        complete = lambda x: self.stencils.last[x[0]] <= n
+        j, rows = lax.while_loop(complete, save, (j, rows))
+        if self.kinks is not None:
+            after = lambda: put(ring, n % NODES, self.node(n, kink, point))
+            ring = lax.cond(kink == 1, after, lambda: ring)
+        return n + 1, j, ring, rows, finite & tree.all_finite(node)
+
+    def rows(self, state):
+        """Their number, they, and whether all nodes were finite."""
+        return state[1], *state[3:]
+
+
+def stack(x: PyTree, number: int) -> PyTree:
+    return jtu.tree_map(lambda x: jnp.broadcast_to(x, (number, *jnp.shape(x))), x)
+
+
+def put(rows: PyTree, i: Array, value: PyTree, here: Any = True) -> PyTree:
+    """Rows with one of them replaced, if it is `here`."""
+
+    def leaf(xs, x):
+        if here is not True:
+            x = jnp.where(here, x, xs[i])
+        return lax.dynamic_update_index_in_dim(xs, cast_to(x, xs), i, 0)
+
+    return jtu.tree_map(leaf, rows, value)

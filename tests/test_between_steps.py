@@ -1,0 +1,233 @@
+"""Values between steps, from the ends of several: error, gradient, and where not."""
+
+from typing import Any
+
+import diffrax as dfx
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+
+import diffrax_presym as dps
+from diffrax_presym._results import FRICTION_TOO_STRONG
+
+
+T1, GAMMA = 20.0, 0.02
+TS = np.linspace(0.0, T1, 161)
+Y0 = jnp.array([1.5, -0.5]), jnp.array([0.0, 0.4])
+RKN4, RKN8, GAUSS = dps.BlanesMoanRKN4(), dps.BlanesCasasRKN8(), dps.PresymplecticGauss
+
+
+def potential(t, q, args):
+    push = 0.3 * jnp.cos(1.2 * t) * q[0]
+    return -jnp.sum(jnp.cos(q)) + 0.25 * (q[0] - q[1]) ** 2 - push
+
+
+def system_of(gamma):
+    friction = dps.ConstantDamping(gamma)
+    return dps.MechanicalSystem(dps.QuadraticKinetic(), potential, friction)
+
+
+def exact(gamma, ts, y0=Y0):
+    def slope(t, y):
+        q, p = y[:2], y[2:]
+        pull = 0.5 * (q[0] - q[1]) * np.array([1.0, -1.0])
+        push = np.array([0.3 * np.cos(1.2 * t), 0.0])
+        return np.concatenate([p, -np.sin(q) - pull + push - gamma * p])
+
+    options: dict[str, Any] = {"rtol": 1e-12, "atol": 1e-13, "method": "DOP853"}
+    start = np.concatenate([np.asarray(x) for x in y0])
+    ends = float(ts[0]), float(ts[-1])
+    y = scipy.integrate.solve_ivp(slope, ends, start, t_eval=ts, **options).y
+    return y[:2].T, y[2:].T
+
+
+def solve(solver, n, ts=TS, gamma=GAMMA, y0=Y0, **options):
+    given = {"saveat": dfx.SaveAt(ts=jnp.asarray(ts)), "max_steps": 4096}
+    given |= {"adjoint": dps.FixedStepAdjoint(), "throw": False}
+    t0, t1 = (0.0, T1) if ts[0] < ts[-1] else (T1, 0.0)
+    dt0 = None if "stepsize_controller" in options and n is None else (t1 - t0) / n
+    return dfx.diffeqsolve(
+        *(system_of(gamma), solver, t0, t1, dt0, y0), **(given | options)
+    )
+
+
+def errors(ys, right, at):
+    """The largest at steps, and at all times, of positions and of momenta."""
+    each = [
+        np.max(np.abs(np.asarray(y) - x), axis=1)
+        for y, x in zip(ys, right, strict=True)
+    ]
+    return [(np.max(x[at]), np.max(x)) for x in each]
+
+
+# The steps with which each has an error of about 1e-3, and half of them.
+SOLVERS = [
+    (RKN4, 20),
+    (dps.BlanesMoan4(), 32),
+    (dps.Suzuki4(), 40),
+    (dps.BlanesMoan6(), 20),
+    (dps.SofroniouSpaletta(8), 40),
+    (RKN8, 40),
+    (GAUSS(2), 32),
+    (GAUSS(4), 40),
+    (dps.SymmetricMultistep(8), 80),
+    (dps.Compensated(RKN4), 20),
+]
+
+
+@pytest.mark.parametrize("solver, n", SOLVERS)
+@pytest.mark.parametrize("finer", [1, 2])
+def test_the_error_between_steps_is_that_at_steps(solver, n, finer):
+    right, n = exact(GAMMA, TS), n * finer
+    sol = solve(solver, n)
+    assert sol.stats["interpolated"] and sol.stats["num_steps"] == n
+    at = slice(None, None, 160 // n) if 160 % n == 0 else np.arange(0, 161, 8)
+    most = 2 if solver.order(None) < 8 else 8
+    for here, all_times in errors(sol.ys, right, at):
+        assert all_times <= most * here < 0.1
+
+
+@pytest.mark.parametrize("solver", [RKN4, dps.BlanesMoan6()])
+def test_backwards_and_by_prescribed_steps(solver):
+    end = tuple(jnp.asarray(x[-1]) for x in exact(GAMMA, TS))
+    ends = T1 * (np.arange(41) / 40 + 0.02 * np.sin(2 * np.pi * np.arange(41) / 40))
+    steps = {"stepsize_controller": dfx.StepTo(jnp.asarray(ends)), "dt0": None}
+    back = solve(solver, 40, TS[::-1], y0=end)
+    there = solve(solver, None, stepsize_controller=steps["stepsize_controller"])
+    for sol, ts in ((back, TS[::-1]), (there, TS)):
+        assert sol.stats["interpolated"]
+        right = exact(GAMMA, TS)
+        right = [x[::-1] for x in right] if ts is not TS else right
+        for here, all_times in errors(sol.ys, right, np.arange(0, 161, 4)):
+            assert all_times <= 3 * here < 1e-3
+
+
+def test_never_across_a_kink():
+    knots, values = np.array([0.0, 4.3, 9.1, T1]), np.array([0.0, 1.0, -1.0, 0.5])
+    force = lambda t, q, args: jnp.interp(t, knots, values) - q
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), dps.ForceField(force))
+    y0 = jnp.zeros(1), jnp.zeros(1)
+
+    def run(ts, dt0) -> Any:
+        return dfx.diffeqsolve(
+            *(system, RKN8, 0.0, T1, dt0, y0),
+            saveat=dfx.SaveAt(ts=ts),
+            stepsize_controller=dps.StepsBetween(knots),
+            adjoint=dps.FixedStepAdjoint(),
+            max_steps=None,
+        )
+
+    sol = run(TS, 0.5)
+    assert sol.stats["interpolated"]
+    assert not run(TS, 4.0).stats["interpolated"]  # steps are too few
+    fine = run(TS, T1 / 1600)
+    assert np.stack(sol.ys) == pytest.approx(np.stack(fine.ys), abs=1e-9)
+
+
+@pytest.mark.parametrize("gamma", [0.4, 4.0, 400.0])
+def test_strong_friction_takes_shorter_steps(gamma):
+    sol = solve(RKN4, 40, gamma=gamma)
+    assert sol.stats["interpolated"] == (gamma == 0.4)
+    if gamma == 400.0:
+        assert sol.result == FRICTION_TOO_STRONG
+        return
+    right = exact(gamma, TS)
+    for here, all_times in errors(sol.ys, right, slice(None, None, 4)):
+        assert all_times <= 10 * here
+
+
+def test_few_steps_and_schemes_of_order_two_take_shorter_steps():
+    assert not solve(RKN4, 2).stats["interpolated"]
+    assert solve(RKN4, 3).stats["interpolated"]
+    assert not solve(dps.PresymplecticLeapfrog(), 40).stats["interpolated"]
+
+
+def test_single_precision_at_late_times():
+    with jax.enable_x64(False):
+        start, ts = 1e5, 1e5 + jnp.linspace(0.0, 16.0, 65, dtype=jnp.float32)
+        system = dps.MechanicalSystem(
+            dps.QuadraticKinetic(), dps.QuadraticPotential(1.0)
+        )
+        y0 = jnp.ones(1, jnp.float32), jnp.zeros(1, jnp.float32)
+        sol: Any = dfx.diffeqsolve(
+            *(system, RKN4, start, start + 16.0, 0.4, y0),
+            saveat=dfx.SaveAt(ts=ts),
+            adjoint=dps.FixedStepAdjoint(),
+        )
+        assert sol.stats["interpolated"] and sol.ys[0].dtype == jnp.float32
+        # Times are multiples of 2^-7 there.
+        t = np.asarray(ts, float) - start
+        assert np.asarray(sol.ys[0][:, 0]) == pytest.approx(np.cos(t), abs=0.01)
+
+
+GRADIENTS = [
+    (RKN4, 40, {}),
+    (RKN8, 40, {}),
+    (dps.TunedRKN6(), 40, {"adjoint": dps.FixedStepAdjoint("checkpoints")}),
+    (GAUSS(3), 40, {}),
+    (RKN4, None, {"stepsize_controller": dfx.StepTo(jnp.linspace(0, T1, 41) ** 1)}),
+    (dps.SymmetricMultistep(8), 160, {}),
+    (RKN4, 40, {"saveat": "gaps"}),
+    (RKN4, 40, {"saveat": "both"}),
+    (RKN4, 40, {"stepsize_controller": dps.StepsBetween(np.array([4.0, 9.1]))}),
+]
+
+
+@pytest.mark.parametrize("solver, n, options", GRADIENTS)
+def test_gradients_are_central_differences(solver, n, options):
+    ts = jnp.asarray(TS[::5]) + 0.01 * jnp.where(jnp.arange(33) < 32, 1.0, 0.0)
+    square = lambda t, y, args: y[0] ** 2 * jnp.cos(t) + y[1]
+    saveat: Any = dfx.SaveAt(ts=ts, fn=square)
+    if options.get("saveat") == "gaps":
+        saveat = dfx.SaveAt(ts=ts.at[jnp.array([0, 3, 4, 32])].set(jnp.nan), fn=square)
+    elif options.get("saveat") == "both":
+        sub = dfx.SubSaveAt(ts=ts, fn=square)
+        saveat = dfx.SaveAt(subs=[sub, dfx.SubSaveAt(ts=ts[::2], t0=True, steps=True)])
+    options = {k: v for k, v in options.items() if k != "saveat"}
+
+    @jax.jit
+    def loss(x):
+        y0 = Y0[0] + x[0], Y0[1]
+        sol: Any = solve(solver, n, gamma=x[1], y0=y0, saveat=saveat, **options)
+        ys = jax.flatten_util.ravel_pytree(sol.ys)[0]
+        weights = jnp.cos(jnp.arange(ys.size, dtype=float))
+        return jnp.sum(jnp.where(jnp.isfinite(ys), ys, 0.0) * weights)
+
+    x, h = jnp.array([0.1, GAMMA]), 1e-5
+    got = np.asarray(jax.jit(jax.grad(loss))(x))
+    for i in range(2):
+        e = h * jnp.eye(2)[i]
+        difference = (loss(x + e) - loss(x - e)) / (2 * h)
+        assert got[i] == pytest.approx(float(difference), rel=1e-6)
+
+
+def test_members_of_a_batch_are_those_alone():
+    gammas = jnp.array([0.02, 3.0, 0.3])  # the second takes shorter steps
+
+    def loss(gamma, y0):
+        sol: Any = solve(RKN4, 40, gamma=gamma, y0=y0)
+        return jnp.sum(sol.ys[0] ** 2), (sol.ys, sol.stats["interpolated"])
+
+    run = jax.value_and_grad(loss, has_aux=True)
+    (_, (ys, interpolated)), got = jax.jit(jax.vmap(run, (0, None)))(gammas, Y0)
+    assert interpolated.tolist() == [True, False, True]
+    for i, gamma in enumerate(gammas):
+        (_, (alone, _)), gradient = jax.jit(run)(gamma, Y0)
+        member = np.stack([y[i] for y in ys])
+        assert member == pytest.approx(np.stack(alone), rel=1e-12, abs=1e-13)
+        assert got[i] == pytest.approx(float(gradient), rel=1e-10)
+
+
+def test_second_derivatives():
+    def loss(x):
+        sol: Any = solve(RKN4, 40, y0=(Y0[0] + x, Y0[1]))
+        return jnp.sum(sol.ys[0][:, 0] ** 2)
+
+    slope, h = jax.jit(jax.grad(loss)), 1e-5
+    _, got = jax.jit(lambda x: jax.jvp(jax.grad(loss), (x,), (jnp.ones(()),)))(0.1)
+    assert got == pytest.approx(
+        float(slope(0.1 + h) - slope(0.1 - h)) / (2 * h), rel=1e-6
+    )
