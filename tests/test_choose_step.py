@@ -68,9 +68,10 @@ def choose(system, solver, t0, t1, y0, tolerance, max_steps=1_000_000, **options
 BACK, S6, DIRECT = (20.0, 0.0, Y0), dps.BlanesMoan6(), {"adjoint": dfx.DirectAdjoint()}
 CASES = {
     "leapfrog": ((PENDULUM, dps.PresymplecticLeapfrog(), *LONG), {}, 1e-4, 1e-4, 3),
-    "grid": ((PENDULUM, RKN6, *LONG), {"ts": REGULAR}, 1e-9, 1e-9, 64),
+    "grid": ((PENDULUM, dps.Strang(), *LONG), {"ts": REGULAR}, 1e-4, 1e-4, 64),
+    "between": ((PENDULUM, RKN6, *LONG), {"ts": REGULAR}, 1e-9, 1e-9, 3),
     "irregular": ((PENDULUM, RKN6, *LONG), {"ts": IRREGULAR}, 1e-7, 1e-9, 3),
-    "backwards": ((PENDULUM, S6, *BACK), {"ts": REGULAR[::-1]}, 1e-4, 1e-6, 64),
+    "backwards": ((PENDULUM, S6, *BACK), {"ts": REGULAR[::-1]}, 1e-4, 1e-6, 3),
     "Diffrax": ((PENDULUM, dfx.Tsit5(), *LONG), DIRECT, 1e-6, 1e-6, 3),
 }
 
@@ -96,8 +97,8 @@ def test_the_tolerance_is_reached(name):
     assert 1 / within <= got <= 1.05
     assert step.claimed_order == (None if name == "Diffrax" else solver.order(system))
     assert step.order > solver.order(system) - 0.7
-    assert step.on_grid == (name != "irregular")
-    if step.on_grid and "ts" in options:
+    assert step.on_grid or name != "grid"
+    if name == "grid":
         spacing = float((sol.ts[1] - sol.ts[0]) / step.dt0)
         ratio = max(spacing, 1 / spacing)
         assert ratio == pytest.approx(round(ratio), rel=1e-12)
@@ -130,23 +131,27 @@ def test_grids(ts, number):
 
 
 @pytest.mark.variants(6)
-@pytest.mark.parametrize("tolerance", [1e-3, 1e-8])
+@pytest.mark.parametrize(
+    "solver, tolerance", [(RKN6, 1e-3), (RKN6, 1e-8), (dps.Strang(), 1e-3)]
+)
 @pytest.mark.parametrize(
     "ts",
     [np.linspace(0, 20, 501), np.array([2.0, 4.0, 14.0]), np.arange(0.25, 20, 0.5)],
 )
-def test_no_other_step_tried_is_cheaper(ts, tolerance):
-    # A saved time inside of a step takes a step more.
+def test_no_other_step_tried_is_cheaper(ts, solver, tolerance):
+    # A saved time inside of a step takes a step more, of schemes up to order two.
     def cost(n):
         ends = ts * n / 20.0
-        return n + np.sum(np.abs(ends - np.round(ends)) > 1e-9)
+        inside = np.sum(np.abs(ends - np.round(ends)) > 1e-9)
+        return n + (inside if solver.order(None) == 2 else 0)
 
-    solve = solve_of(PENDULUM, RKN6, *LONG, ts=jnp.asarray(ts))
+    solve = solve_of(PENDULUM, solver, *LONG, ts=jnp.asarray(ts))
     step = dps.choose_step(solve, 0.0, 20.0, rtol=tolerance, atol=tolerance)
     good = [trial for trial in step.trials if trial.error <= 1]
     assert step.smooth and cost(step.steps) == min(cost(x.steps) for x in good)
-    # Of those that cost as much the one with the most steps is the most accurate.
-    assert len(ts) < 500 or step.steps % 500 == 0
+    if solver is not RKN6 and len(ts) > 500:
+        # Of those that cost as much the one with the most steps is the most accurate.
+        assert step.steps % 500 == 0
     exact = flat(solve(step.dt0 / 2).ys)
     got = np.max(np.abs(flat(solve(step.dt0).ys) - exact) / (1 + np.abs(exact)))
     assert got <= 1.05 * tolerance * max(step.error, 1e-3)
@@ -266,7 +271,7 @@ def test_a_step_that_is_too_large_is_no_error(solver, options, caplog):
     stiff = system_of(lambda t, q, args: 1e3 * jnp.sum(q**4), 0.0)
     step = choose(stiff, solver, 0.0, 1.0, Y0, 1e-4, ts=REGULAR / 20, **options)
     assert any(np.isinf(trial.error) for trial in step.trials)
-    assert step.error <= 1 and step.on_grid
+    assert step.error <= 1
     assert not caplog.records  # no traceback of a trial
 
 

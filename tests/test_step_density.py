@@ -93,6 +93,162 @@ FLYBYS = [(np.inf, 1e-3, -50.0, 30.0), (-1.0, 1e-3, -2.0, 1.5), (-0.1, 0.1, -3.0
 EPSILONS = np.array([0.3, 0.2, 0.1, 0.05, 0.02, 0.01])
 
 
+OWN = dps.FixedStepAdjoint()
+DRAGGED = dps.MechanicalSystem(
+    dps.QuadraticKinetic(),
+    lambda t, q, args: -args / jnp.linalg.norm(q),
+    dps.LogDamping(1.0, shift=20.0),
+)
+
+
+def saved(adjoint, solver=None, density=DISTANCE, sign=1, e=0.6, **kwargs):
+    """An orbit with friction from its apocentre, at 30 times, as a function of what it
+    depends on."""
+    ts = sign * jnp.linspace(0.1, 9.0, 30)
+
+    def states(epsilon, mass, p0):
+        q0 = jnp.array([1 + e, 0.0])
+        p0 = p0 * jnp.array([0.1, 1.0]) * ((1 - e) / (1 + e)) ** 0.5
+        run = partial(solve, control(epsilon, density), solver or dps.BlanesMoanRKN6())
+        y0, saveat = (q0, p0), dfx.SaveAt(ts=ts, t1=True)
+        options = dict(args=mass, adjoint=adjoint, saveat=saveat) | kwargs
+        return run(0.0, ts[-1], y0, DRAGGED, **options)
+
+    return states
+
+
+AT = jnp.array(0.2), jnp.array(1.0), jnp.array([1.0, 0.9])
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(
+    "solver",
+    [
+        LEAPFROG,
+        dps.TunedRKN6(),
+        dps.BlanesMoan4(),
+        dps.PresymplecticGauss(3),
+        dps.Compensated(dps.BlanesMoanRKN4()),
+    ],
+)
+def test_the_loop_of_the_package_takes_the_steps_of_diffrax(solver, sign):
+    run = lambda adjoint: saved(adjoint, solver, sign=sign)(*AT)
+    ours, theirs = map(run, (OWN, dfx.RecursiveCheckpointAdjoint()))
+    assert succeeds(ours) and int(ours.stats["num_steps"]) > 30
+    assert ours.stats["num_steps"] == theirs.stats["num_steps"]
+    assert_close(last(ours.ys), last(theirs.ys), 1e-12)
+    # Between steps each is of the order of the scheme, with errors of its own.
+    order = solver.order(None)
+    assert_close(ours.ys, theirs.ys, {2: 1e-2, 4: 1e-3, 6: 1e-5}[order])
+
+
+@pytest.mark.parametrize(
+    "adjoint",
+    [
+        OWN,
+        dps.FixedStepAdjoint(checkpoints=0),
+        dps.FixedStepAdjoint(checkpoints=5),
+        dps.FixedStepAdjoint("checkpoints"),
+    ],
+)
+@pytest.mark.parametrize("density", [DISTANCE, DRAGGED])
+def test_gradients_in_the_loop_of_the_package(adjoint, density):
+    """Of the discrete solution, with the dependence of the steps on the states: those
+    of Diffrax through the same steps, and central differences."""
+
+    def loss(*args, adjoint=adjoint):
+        ys = saved(adjoint, density=density)(*args).ys
+        return jnp.sum(jnp.sin(ys[0])) + jnp.sum(ys[1] ** 2)
+
+    got = jax.grad(loss, argnums=(0, 1, 2))(*AT)
+    at_ends = lambda *args, adjoint=adjoint: jnp.sum(
+        last(saved(adjoint, density=density)(*args).ys)[0]
+    )
+    theirs = partial(at_ends, adjoint=dfx.RecursiveCheckpointAdjoint())
+    gradient = lambda fn: jax.grad(fn, argnums=(0, 1, 2))(*AT)
+    assert_close(gradient(at_ends), gradient(theirs), 1e-6)
+    for i, x in enumerate(AT):
+        for k in range(x.size):
+            h = 1e-5 * jnp.zeros(x.size).at[k].set(1.0).reshape(x.shape)
+            up, down = (
+                loss(*[y + s * h if i == j else y for j, y in enumerate(AT)])
+                for s in (1.0, -1.0)
+            )
+            assert_close(jnp.ravel(got[i])[k], (up - down) / 2e-5, 1e-5)
+
+
+def test_gradients_of_orbits_of_different_eccentricity():
+    def loss(e, adjoint=OWN):
+        sol = saved(adjoint, e=e, throw=True)(*AT)
+        return jnp.sum(sol.ys[0] ** 2), sol.stats["num_steps"]
+
+    es = jnp.linspace(0.0, 0.95, 16)
+    batch = jax.vmap(jax.value_and_grad(loss, has_aux=True))
+    (values, steps), gradients = batch(es)
+    assert len(set(np.asarray(steps).tolist())) > 8
+    for i in (0, 7, 15):
+        (value, _), gradient = jax.value_and_grad(loss, has_aux=True)(es[i])
+        assert_close((values[i], gradients[i]), (value, gradient), 1e-8)
+
+
+def test_gradients_of_many_steps_take_constant_memory():
+    controller = control(0.01, DISTANCE)
+
+    def end(p, max_steps):
+        sol = solve(
+            *(controller, LEAPFROG, 0.0, 500.0, (Y0[0], p * Y0[1])),
+            **{"adjoint": OWN, "max_steps": max_steps, "throw": True},
+        )
+        return jnp.sum(sol.ys[0]), sol.stats["num_steps"]
+
+    program = jax.jit(jax.value_and_grad(end, has_aux=True), static_argnums=1)
+    compiled = program.lower(jnp.array(1.0), None).compile()
+    memory: Any = compiled.memory_analysis()
+    assert memory.temp_size_in_bytes < 1e5
+    (_, steps), gradient = compiled(jnp.array(1.0))
+    assert steps > 40_000
+    h = 1e-7
+    up, down = (end(jnp.array(1.0 + x), None)[0] for x in (h, -h))
+    assert_close(gradient, (up - down) / (2 * h), 1e-4)
+
+
+def test_a_step_for_a_tolerance():
+    ts = jnp.linspace(0.0, 9.0, 31)
+
+    @eqx.filter_jit
+    def run(epsilon):
+        return dfx.diffeqsolve(
+            *(DRAGGED, dps.TunedRKN6(), 0.0, 9.0, None, Y0),
+            args=1.0,
+            stepsize_controller=control(epsilon, DRAGGED),
+            saveat=dfx.SaveAt(ts=ts),
+            adjoint=OWN,
+            max_steps=None,
+        )
+
+    step = dps.choose_step(run, 0.0, 9.0, rtol=1e-7, atol=1e-7)
+    sol: Any = run(step.dt0)
+    assert step.steps == sol.stats["num_steps"] and not step.on_grid
+    vf = lambda t, y: np.concatenate(DRAGGED.vf(t, (y[:2], y[2:]), 1.0))
+    exact = scipy.integrate.solve_ivp(
+        *(vf, (0, 9), np.concatenate(Y0), "DOP853", np.asarray(ts)),
+        rtol=1e-12,
+        atol=1e-12,
+    )
+    error = np.abs(np.hstack(sol.ys) - exact.y.T) / (1e-7 + 1e-7 * np.abs(exact.y.T))
+    assert 0.05 < np.max(error) < 1.5
+
+
+def test_the_time_scale_of_a_system():
+    scale = lambda system, q: control(1.0, system).density(0.0, (q, 0 * q), 1.0)
+    potential = lambda t, q, args: args * jnp.sum(jnp.array([1.0, 25.0]) * q**2) / 2
+    springs = dps.MechanicalSystem(dps.QuadraticKinetic(2.0), potential)
+    assert_close(scale(springs, jnp.ones(2)), (0.5**2 + 12.5**2) ** -0.25, 1e-12)
+    q = jnp.array([0.3, 0.4])
+    assert_close(scale(DRAGGED, 4 * q) / scale(DRAGGED, q), 8.0, 1e-12)
+    assert_close(scale(DRAGGED, q), 5**-0.25 * 0.5**1.5, 1e-12)
+
+
 @pytest.mark.parametrize("backwards", [False, True])
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_close_encounters_are_right_or_fail(dtype, backwards):
@@ -343,6 +499,11 @@ vector = lambda t, y, args: y[0]
         (lambda: control(0.1, WRONG), "density"),
         (lambda: solve(CONTROL, LEAPFROG, 0.0, 1.0, Y0, dt0=0.1), "dt0=None"),
         (lambda: solve(control(0.1, vector), LEAPFROG, 0.0, 1.0, Y0), "real scalar"),
+        (lambda: saved(OWN, saveat=STEPS)(*AT), "`SaveAt.steps=...."),
+        (
+            lambda: solve(CONTROL, dps.SymmetricMultistep(), 0.0, 1.0, Y0, adjoint=OWN),
+            "equal steps",
+        ),
     ],
 )
 def test_bad_input_says_what_to_write(make, message):

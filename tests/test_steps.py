@@ -44,6 +44,21 @@ def test_an_infinite_step_is_as_long_as_it_can_be(adjoint, controller, steps):
     np.testing.assert_allclose(np.ravel(sol.ys), exact([1.0])[:, 0], atol=1e-6)
 
 
+@pytest.mark.parametrize("adjoint", [OWN, dfx.RecursiveCheckpointAdjoint()])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_between_regular_times_there_is_one_step(adjoint, dtype, sign):
+    """Whose length is that between the times, but for their rounding."""
+    times = sign * np.linspace(0.0, 100.0, 2001).astype(dtype)
+    sol = dfx.diffeqsolve(
+        *(PENDULUM, dps.PresymplecticLeapfrog(), times[0], times[-1]),
+        *(jnp.asarray(sign * 0.05, dtype), 2 * (jnp.ones(1, dtype),)),
+        stepsize_controller=dps.StepsBetween(times[::-1]),
+        **{"adjoint": adjoint, "max_steps": 4000},  # pyright: ignore
+    )
+    assert sol.stats["num_steps"] == 2000
+
+
 @pytest.mark.parametrize("dt0", [jnp.nan, -jnp.inf])
 def test_a_step_that_is_no_step(dt0):
     try:

@@ -1,4 +1,4 @@
-"""The loop for steps that are known beforehand, as an adjoint of Diffrax."""
+"""The loop of the package, as an adjoint of Diffrax."""
 
 from typing import Literal
 
@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 
 from .._checks import as_positive
 from .._scheme._base import AbstractPresymplecticSolver, Scheme
+from .._step_size._density import StepDensityController
 from .._system._bound import bind
 from . import _diffrax as private
 from ._backward import Backward
@@ -18,24 +19,32 @@ from ._kept import Checkpoints, Reversal
 from ._problem import Problem
 from ._run import run, saved_rows
 from ._steps import Steps, StepsBetween
+from ._variable import Clock, VariableSteps
 
 
 class FixedStepAdjoint(dfx.AbstractAdjoint):
-    r"""The loop for steps that are known beforehand, and exact gradients in it: the
-    recommended way to solve, with or without gradients.
+    r"""The loop for steps that are known beforehand or reversible, and exact gradients
+    in it: the recommended way to solve, with or without gradients.
 
-    Between steps the solution is a shorter step of the scheme, of its full order. A
-    solve whose final or saved states are not finite fails; of an explicit scheme it
-    ends at the next saved time, as the steps between are not checked. For a time of
-    `SaveAt(ts=...)` that is NaN, a gap in measured times, nothing is saved: the row
-    stays infinite, as do rows after the end of a solve.
+    Between steps the solution is a Hermite interpolation of degree 11 from the ends of
+    four steps, which takes no step of the scheme. Where that cannot follow the motion,
+    it is a shorter step: of schemes up to order two, in spans of fewer than three
+    steps, where friction over a step is more than 0.5, and with variable steps. The
+    statistics say which,
+    `sol.stats["interpolated"]`. A solve whose final or saved states are not finite
+    fails; of an explicit scheme it ends at the next saved time or end of a step that is
+    used for one, as other steps are not checked. For a time of `SaveAt(ts=...)` that is
+    NaN, a gap in measured times, nothing is saved: the row stays infinite, as do rows
+    after the end of a solve.
 
     For every solver of this package, with `diffrax.ConstantStepSize`,
-    [`diffrax_presym.StepsBetween`][] or `diffrax.StepTo`, and any `SaveAt` but dense
-    output. With a constant step the steps are all equal: as few as are not longer than
-    `dt0`. (Diffrax takes the first of the length `dt0`, if that does not divide the
-    time of the solve; and its times may differ in the last bit.) Events, dense output
-    and adaptive steps are errors; use `diffrax.RecursiveCheckpointAdjoint` for these.
+    [`diffrax_presym.StepsBetween`][], `diffrax.StepTo` or
+    [`diffrax_presym.StepDensityController`][], and any `SaveAt` but dense output, and
+    with variable steps `steps=`. With a constant step the steps are all equal: as few
+    as are not longer than `dt0`. (Diffrax takes the first of the length `dt0`, if that
+    does not divide the time of the solve; and its times may differ in the last bit.)
+    Events, dense output and adaptive steps are errors; use
+    `diffrax.RecursiveCheckpointAdjoint` for these.
 
     The gradient is that of the discrete solution ("discretise, then optimise"), with
     respect to `y0`, `args`, the system, the solver, and everything that a function of
@@ -94,9 +103,9 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         progress_meter,
     ):
         del passed_solver_state
-        y, carry, made_jump, meter = private.start_of(init_state)
+        y, carry, made_jump, meter, control = private.start_of(init_state)
         system = bind(terms, args, y)
-        unsupported = event, saveat.dense, passed_controller_state
+        unsupported = event, saveat, passed_controller_state
         _check(solver, stepsize_controller, *unsupported)
         scheme = solver.scheme(system)
         _check_history(solver, scheme, stepsize_controller)
@@ -106,18 +115,24 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
             restart = lambda: scheme.start(system, system.time(t0), y)
             carry = lax.cond(made_jump, restart, lambda: carry)
         subs, structure = private.flatten_subs(saveat)
+        if isinstance(stepsize_controller, StepDensityController):
+            steps = VariableSteps(t0, t1, stepsize_controller)
+            carry = carry, Clock(t0, control)
+        else:
+            steps = Steps(stepsize_controller, t0, t1, dt0)
         problem = Problem(
             solver,
             system,
             subs,
             (y, carry),
-            Steps(stepsize_controller, t0, t1, dt0),
+            steps,
             max_steps,
             (progress_meter, meter),
             reversal=isinstance(way, Reversal),
         )
         final = _final_state(problem, way, init_state, structure)
-        return final, {"order": solver.order(terms)}
+        about = {"order": solver.order(terms), "interpolated": problem.interpolates}
+        return final, about
 
     def _way(
         self, solver, scheme: Scheme, max_steps: int | None, throw: bool
@@ -158,22 +173,24 @@ whose times do not start at `t0` and end at `t1`.
 """
 
 
-def _check(solver, controller, event, dense, passed_controller_state) -> None:
+def _check(solver, controller, event, saveat, passed_controller_state) -> None:
     what, instead = None, "`diffrax.RecursiveCheckpointAdjoint()`"
     # An instance of `HalfSolver` is one of the class of the solver in it.
     known = isinstance(solver, AbstractPresymplecticSolver)
     if not known or isinstance(solver, dfx.HalfSolver):
         what = f"`{type(solver).__name__}`, only solvers of this package"
-    elif not isinstance(controller, dfx.ConstantStepSize | dfx.StepTo | StepsBetween):
+    elif not isinstance(controller, (*_KNOWN, StepDensityController)):
         what = (
-            f"`{type(controller).__name__}`, only `ConstantStepSize`, `StepTo` and "
-            "`StepsBetween`"
+            f"`{type(controller).__name__}`, only `ConstantStepSize`, `StepTo`, "
+            "`StepsBetween` and `StepDensityController`"
         )
     elif event is not None:
         what = "events"
-    elif dense:
+    elif saveat.dense:
         what = "dense output"
-    elif passed_controller_state:
+    elif not isinstance(controller, _KNOWN) and _saves_steps(saveat):
+        what = "`SaveAt(steps=...)` with `StepDensityController`"
+    elif isinstance(controller, _KNOWN) and passed_controller_state:
         what = "a `controller_state`"
     if what is not None:
         raise ValueError(
@@ -181,7 +198,19 @@ def _check(solver, controller, event, dense, passed_controller_state) -> None:
         )
 
 
+_KNOWN = dfx.ConstantStepSize, dfx.StepTo, StepsBetween
+
+
+def _saves_steps(saveat: dfx.SaveAt) -> bool:
+    return any(sub.steps for sub in private.flatten_subs(saveat)[0])
+
+
 def _check_history(solver, scheme: Scheme, controller) -> None:
+    if scheme.has_history and isinstance(controller, StepDensityController):
+        raise ValueError(
+            f"`{type(solver).__name__}` needs equal steps. With `StepDensityController`"
+            " use `TunedRKN6()` or `BlanesCasasRKN8()`."
+        )
     if scheme.has_history and isinstance(controller, StepsBetween):
         raise ValueError(
             "Steps end at the times of `StepsBetween` because the motion is not smooth "
@@ -199,12 +228,16 @@ def _final_state(problem: Problem, way: Reversal | Checkpoints, init_state, stru
     end, saved, n, result, meter = eqx.combine(
         out, eqxi.nondifferentiable_backward(counts)
     )
+    carry, control = end[1], None
+    if isinstance(problem.steps, VariableSteps):
+        carry, (_, control) = carry
     return private.final_state(
         init_state,
         structure,
         y=end[0],
-        solver_state=end[1],
-        t=problem.steps.time(n),
+        solver_state=carry,
+        control=control,
+        t=problem.time(n, end),
         steps=n,
         result=result,
         meter=meter,
@@ -215,16 +248,14 @@ def _final_state(problem: Problem, way: Reversal | Checkpoints, init_state, stru
 @eqx.filter_custom_vjp
 def _solve(inputs, way: Reversal | Checkpoints):
     problem, buffers = inputs
-    return _outputs(problem, buffers, run(problem)[0])
+    return _outputs(problem, buffers, run(problem))
 
 
 def _outputs(problem: Problem, buffers, out):
     """What Diffrax needs of a solve."""
-    progress, result, values = out
-    saved = [
-        saved_rows(problem, i, buffer, rows, progress)
-        for i, (buffer, rows) in enumerate(zip(buffers, values, strict=True))
-    ]
+    (progress, result, values), trace = out
+    each = zip(trace.rows, buffers, values, strict=True)
+    saved = [saved_rows(problem, i, *x, progress) for i, x in enumerate(each)]
     return progress.point, saved, progress.n, result, progress.meter
 
 
@@ -237,13 +268,14 @@ def _solve_fwd(perturbed, inputs, way: Reversal | Checkpoints):
             "(`t0`, `t1`, `dt0`, `ts`). Use `diffrax.RecursiveCheckpointAdjoint()` "
             "instead."
         )
-    out, trace = run(problem, way.places(problem))
-    return _outputs(problem, buffers, out), trace
+    out = run(problem, way.track(problem))
+    return _outputs(problem, buffers, out), out[1]
 
 
 @_solve.def_bwd
 def _solve_bwd(trace, bars, perturbed, inputs, way: Reversal | Checkpoints):
     problem, buffers = inputs
+    problem = eqx.tree_at(lambda problem: problem.rows, problem, trace.rows)
     (_, carry_bar), saved_bars, *_ = bars
     zeros = lambda like, bar: jtu.tree_map(
         lambda x, b: jnp.zeros_like(x) if b is None else b,

@@ -1,7 +1,8 @@
 """The backward pass through the steps of a solve, and through what was saved."""
 
+import abc
 from collections.abc import Callable
-from functools import partial, reduce
+from functools import reduce
 from typing import Any
 
 import equinox as eqx
@@ -14,8 +15,10 @@ from jaxtyping import Array, Int, PyTree
 from .. import _tree as tree
 from .._numbers import State
 from .._scheme._base import Point
+from ._nodes import NODES, Stencils
 from ._problem import Functions, Problem
 from ._run import end_is_separate, Trace
+from ._tracks import put, stack
 
 
 def _zeros(x: PyTree) -> PyTree:
@@ -30,7 +33,7 @@ class BackwardState(eqx.Module):
     point: Point
     bar: PyTree  # the cotangents of the state and the solver state
     gradient: PyTree  # the cotangents of the functions so far
-    left: list[Array]  # the number of rows left, of each output
+    tracks: list[PyTree]  # the states of `Backward.tracks`
     # The end of the last step, as the backward pass came to it, and from its start.
     ends: tuple[State, State]
 
@@ -58,7 +61,7 @@ class Backward(eqx.Module):
         """What is differentiated of the functions, and the rest."""
         return eqx.partition(self.problem.functions, self.wanted)
 
-    def _pull(self, fn: Callable[..., PyTree], bar: PyTree, *args: PyTree):
+    def pull(self, fn: Callable[..., PyTree], bar: PyTree, *args: PyTree):
         """Pull back `fn(functions, *args)`: the cotangents of the functions and of the
         arguments."""
         moved, fixed = self._functions
@@ -67,58 +70,50 @@ class Backward(eqx.Module):
         )
         return jax.vjp(redo, moved, *args)[1](bar)
 
-    def end(self) -> tuple[BackwardState, list[Callable]]:
-        """The end of the solve, and for each output how one of its rows is pulled back.
-
-        Outputs that were computed all at once are pulled back here, to the starts of
-        their steps.
-        """
+    def end(self) -> BackwardState:
+        """The end of the solve."""
         problem, n, point = self.problem, self.trace.n, self.trace.end
         at = BackwardState(
             n,
             point,
             (_zeros(point[0]), self.carry_bar),
             _zeros(self._functions[0]),
-            [jnp.sum(rows.reached(n)) for rows in problem.rows],
+            [track.start(self) for track in self.tracks],
             (point[0], point[0]),
         )
-        pulls = []
         for i, (sub, rows) in enumerate(zip(problem.subs, problem.rows, strict=True)):
             separate = end_is_separate(sub, n) if sub.t1 else None
             if separate is not None:
-                row = self._row(i, int(sub.t0) + at.left[i], separate)
+                last = int(sub.t0) + jnp.sum(rows.reached(n))
+                row = self.row(i, last, separate)
                 at = at.add(*self._pull_point(i, n, point, row))
-            pull = partial(self._pull_row, i)
-            if len(rows) and problem.at_once:
-                more, starts = self._pull_rows(i)
-                at = at.add(more, _zeros(at.bar))
-                pull = lambda at, j, starts=starts: (
-                    _zeros(at.gradient),
-                    jtu.tree_map(lambda x: x[j], starts),
-                )
-            pulls.append(pull)
-        return at, pulls
+        return at
+
+    @property
+    def tracks(self) -> list["AbstractPull"]:
+        problem, tracks = self.problem, []
+        for i, (rows, stencils) in enumerate(
+            zip(problem.rows, problem.stencils, strict=True)
+        ):
+            tracks += [PullRows(i, rows.stop)] if len(rows) else []
+            tracks += [] if stencils is None else [PullNodes(i, stencils)]
+        return tracks
 
     def start(self, at: BackwardState) -> BackwardState:
         """Pull back the outputs of `t0`."""
         for i, sub in enumerate(self.problem.subs):
             if sub.t0:
-                row = self._row(i, jnp.asarray(0), True)
+                row = self.row(i, jnp.zeros((), int), True)
                 at = at.add(*self._pull_point(i, at.n, at.point, row))
         return at
 
-    def back_to(
-        self, at: BackwardState, pulls: list[Callable], first: Array, start: Start
-    ) -> BackwardState:
+    def back_to(self, at: BackwardState, first: Array, start: Start) -> BackwardState:
         """All steps back to the start of step `first`, and what was saved there."""
+        tracks = self.tracks
 
-        def due(at: BackwardState) -> list[Any]:
-            def stop(rows, left):
-                stop = rows.stop[left - 1]
-                return jnp.where(left > 0, jnp.where(stop < 0, at.n, stop), -1)
-
-            pairs = zip(self.problem.rows, at.left, strict=True)
-            return [stop(rows, left) if len(rows) else -1 for rows, left in pairs]
+        def due(at: BackwardState) -> list[Array]:
+            pairs = zip(tracks, at.tracks, strict=True)
+            return [track.due(state, at.n) for track, state in pairs]
 
         def steps(at: BackwardState, stop: Array) -> BackwardState:
             def back(at: BackwardState) -> BackwardState:
@@ -128,7 +123,7 @@ class Backward(eqx.Module):
 
             return lax.while_loop(lambda at: at.n > stop, back, at)
 
-        if not any(map(len, self.problem.rows)):
+        if not tracks:
             return steps(at, first)
 
         def more(at: BackwardState):
@@ -137,14 +132,13 @@ class Backward(eqx.Module):
         def stop(at: BackwardState) -> BackwardState:
             wanted = due(at)
             at = steps(at, reduce(jnp.maximum, wanted, first))
-            for i, step in enumerate(wanted):
-                if len(self.problem.rows[i]) == 0:
-                    continue
-                here, left = step == at.n, list(at.left)
-                pull = lambda at, i=i, left=left: at.add(*pulls[i](at, left[i] - 1))
-                at = lax.cond(here, pull, lambda at: at, at)
-                left[i] = jnp.where(here, left[i] - 1, left[i])
-                at = eqx.tree_at(lambda at: at.left, at, left)
+            for i, (track, wanted_step) in enumerate(zip(tracks, wanted, strict=True)):
+
+                def pull(at: BackwardState, i=i, track=track) -> BackwardState:
+                    at, state = track.pull(self, at, at.tracks[i])
+                    return eqx.tree_at(lambda at: at.tracks[i], at, state)
+
+                at = lax.cond(wanted_step == at.n, pull, lambda at: at, at)
             return at
 
         return lax.while_loop(more, stop, at)
@@ -161,47 +155,136 @@ class Backward(eqx.Module):
         end, pull = jax.vjp(redo, moved, point)
         more, bar = pull(at.bar)
         gradient, ends = tree.sum(at.gradient, more), (at.point[0], end[0])
-        return BackwardState(n, point, bar, gradient, at.left, ends)
+        return BackwardState(n, point, bar, gradient, at.tracks, ends)
 
-    def _row(self, i: int, row: Array, pred: Any) -> PyTree:
+    def row(self, i: int, row: Array, pred: Any) -> PyTree:
         """The cotangent of one row of an output, or zero."""
         return jtu.tree_map(lambda x: jnp.where(pred, x[row], 0), self.saved_bars[i])
 
     def _pull_point(self, i: int, n: Array, point: Point, bar: PyTree):
         """Pull back an output saved at a step, to the functions and the state."""
-        y, carry = point
-        output = lambda functions, y: functions.outputs[i](
-            self.problem.steps.time(n), y
-        )
-        gradient, y_bar = self._pull(output, bar, y)
+        (y, carry), time = point, self.problem.time(n, point)
+        output = lambda functions, y: functions.outputs[i](time, y)
+        gradient, y_bar = self.pull(output, bar, y)
         return gradient, (y_bar, _zeros(carry))
 
-    def _pull_row(self, i: int, at: BackwardState, j: Array):
-        """Pull back one row of an output, from the start of its step."""
-        rows = self.problem.rows[i]
-        bar = self._row(i, int(self.problem.subs[i].t0) + j, rows.stop[j] >= 0)
+
+class AbstractPull(eqx.Module):
+    """How what a track collected is pulled back, on the way back."""
+
+    i: int = eqx.field(static=True)  # the output
+
+    @abc.abstractmethod
+    def start(self, backward: Backward) -> PyTree:
+        """The state at the end of the solve."""
+
+    @abc.abstractmethod
+    def due(self, state: PyTree, n: Array) -> Array:
+        """The next step at whose start something is pulled back, from step `n` on."""
+
+    @abc.abstractmethod
+    def pull(
+        self, backward: Backward, at: BackwardState, state: PyTree
+    ) -> tuple[BackwardState, PyTree]:
+        """Pull back what is due."""
+
+
+class PullRows(AbstractPull):
+    """Values at steps, or of shorter ones from there; the state is their number."""
+
+    stops: Array
+
+    def start(self, backward):
+        problem, i = backward.problem, self.i
+        number = jnp.sum(problem.rows[i].reached(backward.trace.n))
+        stencils = problem.stencils[i]
+        return (
+            number if stencils is None else jnp.where(stencils.ways.others, number, 0)
+        )
+
+    def due(self, state, n):
+        stop = self.stops[state - 1]
+        return jnp.where(state > 0, jnp.where(stop < 0, n, stop), -1)
+
+    def pull(self, backward, at, state):
+        i, j, problem = self.i, state - 1, backward.problem
+        rows = problem.rows[i]
+        taken = rows.stop[j] >= 0
+        if (stencils := problem.stencils[i]) is not None:
+            taken &= ~stencils.ways.interpolated
+        bar = backward.row(i, int(problem.subs[i].t0) + j, taken)
 
         def pull(shorter: bool):
             def output(functions: Functions, start: Point):
-                return self.problem.output(i, functions, j, start, shorter)[0]
+                return problem.output(i, functions, j, start, shorter)[0]
 
-            return self._pull(output, bar, at.point)
+            return backward.pull(output, bar, at.point)
 
         if not rows.may_be_inside:
-            return pull(False)
+            return at.add(*pull(False)), j
         # Decided before the derivative is taken: in a batch, JAX would differentiate
         # the branch that is not taken at zeros, where an implicit step is singular.
-        return lax.cond(rows.inside[j], lambda: pull(True), lambda: pull(False))
+        pulled = lax.cond(rows.inside[j], lambda: pull(True), lambda: pull(False))
+        return at.add(*pulled), j
 
-    def _pull_rows(self, i: int):
-        """Pull back all rows of an output."""
-        problem, rows, n = self.problem, self.problem.rows[i], self.trace.n
-        taken, first = rows.taken(n), int(problem.subs[i].t0)
 
-        def bar(x):
-            keep = taken.reshape(-1, *(1,) * (x.ndim - 1))
-            return jnp.where(keep, x[first : first + len(taken)], 0)
+class PullNodes(AbstractPull):
+    """Values between steps, by the cotangents of the last few nodes."""
 
-        bars = jtu.tree_map(bar, self.saved_bars[i])
-        outputs = lambda functions, starts: problem.outputs(i, functions, starts, n)[0]
-        return self._pull(outputs, bars, self.trace.starts[i])
+    stencils: Stencils
+
+    def start(self, backward):
+        n, node = backward.trace.n, (backward.trace.end[0],) * 3
+        number, _ = backward.trace.between[self.i]
+        return n + 1, n + 1, number, _zeros(stack(node, NODES))
+
+    def due(self, state, n):
+        node, low, j, _ = state
+        last = self.stencils.last[j - 1]
+        row = jnp.where(j > 0, jnp.where(last < 0, n, last), -1)
+        return jnp.where(node > low, node - 1, row)
+
+    def pull(self, backward, at, state):
+        problem, i, n = backward.problem, self.i, at.n
+        rows, start = problem.rows[i], problem.start[0]
+
+        def spread(x):
+            gradient, low, j, bars = x
+            j = j - 1
+            taken = (rows.stop[j] >= 0) & self.stencils.ways.interpolated
+            bar = backward.row(i, int(problem.subs[i].t0) + j, taken)
+            # Of the others nothing may fail of which a gradient takes zero times.
+            time = jnp.where(taken, rows.time[j], problem.steps.t0)
+            y = jtu.tree_map(lambda x: x[j], backward.trace.between[i][1])
+            y = tree.where(taken, y, start)
+            output = lambda functions, y: functions.outputs[i](time, y)
+            more, bar = backward.pull(output, bar, y)
+            bars = self.stencils.spread(j, bar, bars)
+            low = jnp.where(rows.stop[j] >= 0, self.stencils.first[j], low)
+            return tree.sum(gradient, more), low, j, bars
+
+        def unspread(x):
+            last = self.stencils.last[x[2] - 1]
+            return (x[2] > 0) & ((last < 0) | (last >= n))
+
+        def pull(side: Array, at: BackwardState, bars: PyTree):
+            node = lambda functions, point: functions.node(n, side, point)
+            bar = jtu.tree_map(lambda x: x[n % NODES], bars)
+            at = at.add(*backward.pull(node, bar, at.point))
+            return at, put(bars, n % NODES, _zeros(bar))
+
+        _, low, j, bars = state
+        kink, kinks = jnp.zeros((), int), problem.steps.kinks
+        if kinks is not None:
+            kink = jnp.any(kinks == n).astype(int)
+            after = lambda: pull(kink, at, bars)
+            at, bars = lax.cond(kink == 1, after, lambda: (at, bars))
+        gradient, low, j, bars = lax.while_loop(
+            unspread, spread, (at.gradient, low, j, bars)
+        )
+        at = eqx.tree_at(lambda at: at.gradient, at, gradient, is_leaf=_is_none)
+        at, bars = pull(-kink, at, bars)
+        return at, (n, low, j, bars)
+
+
+_is_none = lambda x: x is None

@@ -18,10 +18,11 @@ def flatten_subs(saveat: dfx.SaveAt) -> tuple[list[dfx.SubSaveAt], Any]:
     return jtu.tree_flatten(saveat.subs, is_leaf=is_sub)
 
 
-def start_of(state) -> tuple[PyTree, PyTree, Any, PyTree]:
-    """The initial state and solver state, whether that is stale, and the state of the
-    progress meter."""
-    return state.y, state.solver_state, state.made_jump, state.progress_meter_state
+def start_of(state) -> tuple[PyTree, PyTree, Any, PyTree, PyTree]:
+    """The initial state and solver state, whether that is stale, and the states of the
+    progress meter and the controller."""
+    meter, control = state.progress_meter_state, state.controller_state
+    return state.y, state.solver_state, state.made_jump, meter, control
 
 
 def saved_buffers(state, structure) -> list[tuple[Array, PyTree]]:
@@ -40,11 +41,13 @@ def final_state(
     result: dfx.RESULTS,
     meter: PyTree,
     saved: list[tuple[Array, PyTree, Array, Array]],
+    control: PyTree | None = None,
 ):
     """Diffrax's state at the end of a solve of so many `steps`, from that at its start.
 
     `saved` has the times, the values, the number of rows and the number of times of
-    `ts` of each output.
+    `ts` of each output; `control` is the state of the controller, if that is more than
+    a count of steps.
     """
     saves = [
         eqx.tree_at(
@@ -69,7 +72,7 @@ def final_state(
         "result": result,
         "progress_meter_state": meter,
         "save_state": jtu.tree_unflatten(structure, saves),
-        "controller_state": controller,
+        "controller_state": controller if control is None else control,
         "made_jump": False,
     }
     where = lambda x: [getattr(x, name) for name in new]

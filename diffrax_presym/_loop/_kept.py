@@ -10,8 +10,12 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, PyTree
 
 from .. import _tree as tree
+from .._scheme._base import Point
 from ._backward import Backward, BackwardState
 from ._problem import Problem
+from ._steps import MOST_STEPS
+from ._tracks import AbstractTrack, Track
+from ._variable import Kept, VariableSteps
 
 
 # The least number of steps between two kept states, of a gradient by reversal.
@@ -52,11 +56,17 @@ class Reversal(eqx.Module):
         parts = jnp.clip(parts, 1, most)
         return _until(last, jnp.arange(most) * -(-last // parts))
 
+    def track(self, problem: Problem) -> AbstractTrack:
+        if isinstance(problem.steps, VariableSteps):
+            return Kept(self.most + 1, problem.start)
+        return _track(self.places(problem), problem)
+
     def pull_back(self, backward: Backward) -> BackwardState:
         problem, trace = backward.problem, backward.trace
-        places, undo = self.places(problem), problem.undo
+        places, states = trace.kept
+        undo = problem.undo
         assert undo is not None
-        at, pulls = backward.end()
+        at = backward.end()
         # Positions and momenta are compared in units of their largest values. The
         # solver state may be pure rounding, and is not compared.
         units = jtu.tree_map(
@@ -74,12 +84,18 @@ class Reversal(eqx.Module):
         def part(x):
             at, worst, j = x
             j, end = j - 1, at.point[0]
-            first, known = places[j], jtu.tree_map(lambda x: x[j], trace.kept)
-            # A kept state is the start of its step, which need not be inverted.
-            inverted = lambda n, point: lax.cond(
-                n == first, lambda: known, lambda: undo(n, point)
-            )
-            at = backward.back_to(at, pulls, first, inverted)
+            first, known = places[j], jtu.tree_map(lambda x: x[j], states)
+
+            def start(n: Array, point: Point) -> Point:
+                # A kept state is the start of its step, which need not be inverted.
+                back = lambda: undo(n, point)
+                if trace.before is not None:
+                    back = lambda back=back: lax.cond(
+                        n == trace.n - 1, lambda: trace.before, back
+                    )
+                return lax.cond(n == first, lambda: known, back)
+
+            at = backward.back_to(at, first, start)
             miss = size(tree.sub(*at.ends))
             largest = jnp.maximum(size(known[0]), size(end))
             miss = miss / jnp.where(largest > 0, largest, 1)  # at rest at the origin
@@ -135,14 +151,17 @@ class Checkpoints(eqx.Module):
         number = max(-(-(self.max_steps or 0) // length), 1)
         return _until(problem.last, jnp.arange(number) * length)
 
+    def track(self, problem: Problem) -> AbstractTrack:
+        return _track(self.places(problem), problem)
+
     def pull_back(self, backward: Backward) -> BackwardState:
-        places, length = self.places(backward.problem), self.length
+        (places, states), length = backward.trace.kept, self.length
 
         def part(x):
             at, j = x
             j = j - 1
             first = places[j]
-            known = jtu.tree_map(lambda x: x[j], backward.trace.kept)
+            known = jtu.tree_map(lambda x: x[j], states)
             stack = lambda x: jnp.broadcast_to(x, (length, *jnp.shape(x)))
 
             def again(n, x):
@@ -156,12 +175,19 @@ class Checkpoints(eqx.Module):
             begin = known, jtu.tree_map(stack, known)
             _, points = lax.fori_loop(first, at.n - 1, again, begin)
             start = lambda n, _: jtu.tree_map(lambda x: x[n - first], points)
-            return backward.back_to(at, pulls, first, start), j
+            return backward.back_to(at, first, start), j
 
-        at, pulls = backward.end()
+        at = backward.end()
         parts = jnp.maximum(jnp.sum(places < backward.trace.n), 1)
         at, _ = lax.while_loop(lambda x: x[1] > 0, part, (at, parts))
         return backward.start(at)
+
+
+def _track(places: Array, problem: Problem) -> AbstractTrack:
+    """What is kept: the steps, and the states at their starts."""
+    last, value = problem.last, lambda j, point: (places[j], point)
+    none = jnp.asarray(MOST_STEPS, places.dtype), problem.start
+    return Track(places, places <= last, last + 1, value, none)
 
 
 def _until(last: Array, places: Array) -> Array:

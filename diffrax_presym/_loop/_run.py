@@ -1,12 +1,11 @@
-"""The loop over steps that are known beforehand, and what is saved.
+"""The loop over steps, and what is saved.
 
-Diffrax's loop asks after each step whether something is to be saved in it. Here the
-steps, and those in which the saved times fall, are known, so that the loop runs from
-one to the next without asking. Between steps the solution is a shorter step of the
-scheme, of its full order.
+Diffrax's loop asks after each step whether something is to be saved in it. Where the
+steps, and those in which the saved times fall, are known beforehand, the loop runs from
+one to the next without asking. Between steps the solution is interpolated from the ends
+of several, or a shorter step of the scheme.
 """
 
-from collections.abc import Callable
 from functools import reduce
 from typing import Any
 
@@ -18,11 +17,13 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Int, PyTree
 
 from .. import _tree as tree
-from .._numbers import cast_to
 from .._results import NONFINITE
 from .._scheme._base import Point
 from .._scheme._engine import cheap_iterations
 from ._problem import Problem
+from ._steps import Rows
+from ._tracks import AbstractTrack, Interpolated, put, Track
+from ._variable import Timed, VariableSteps
 
 
 # The steps of a loop whose length is known, for which the host does not wait on a GPU.
@@ -36,24 +37,7 @@ class Progress(eqx.Module):
     point: Point
     result: dfx.RESULTS | None  # `None` if no step can fail
     meter: PyTree
-
-
-class Track(eqx.Module):
-    """Values at the starts of given steps, in order."""
-
-    # After those that are due a step that is never reached. The row that belongs to it
-    # takes what is not a value: to choose between rows would copy all of them.
-    stops: Int[Array, " rows+1"]
-    value: Callable[[Array, Point], PyTree]  # of the row and the state there
-    init: PyTree
-
-    def __init__(self, stops, is_due, never, value: Callable, init: PyTree):
-        self.stops = jnp.append(jnp.where(is_due, stops, never), never)
-        self.value, self.init = value, init
-
-    def start(self) -> tuple[Array, PyTree]:
-        stack = lambda x: jnp.broadcast_to(x, (len(self.stops), *jnp.shape(x)))
-        return jnp.asarray(0), jtu.tree_map(stack, self.init)
+    before: Point | None  # the start of the last step, if that may be cut off
 
 
 class Trace(eqx.Module):
@@ -61,111 +45,170 @@ class Trace(eqx.Module):
 
     n: Int[Array, ""]
     end: Point
-    starts: list[PyTree]  # of the rows of each output, if computed at once
-    kept: PyTree
+    # The number of interpolated rows and the states in them, of each output.
+    between: list[PyTree]
+    kept: PyTree  # the steps whose starting states are kept, and these
+    before: Point | None  # as in `Progress`
+    rows: list[Rows]  # of which the steps are known now
 
 
-def run(problem: Problem, keep: Array | None = None):
-    """The end of a solve, what each output saved, and a trace.
+def run(problem: Problem, kept: AbstractTrack | None = None):
+    """The end of a solve, what each output saved, and a trace, with the states `kept`
+    for a gradient."""
+    number, keep = len(problem.rows), kept is not None
+    tracks = [_tracks(problem, i, keep) for i in range(number)]
+    progress, (stacked, kept_states) = _walk(problem, (tracks, kept))
 
-    `keep` are the steps whose starting states are kept.
-    """
-    last = problem.last
-    tracks = [
-        None if len(rows) == 0 else _track(problem, i)
-        for i, rows in enumerate(problem.rows)
-    ]
-    kept = None
-    if keep is not None:
-        value = lambda j, point: point
-        kept = Track(keep, keep <= last, last + 1, value, problem.start)
-    progress, (stacked, kept) = _walk(problem, (tracks, kept))
-
-    saved, finite, starts = [], tree.all_finite(progress.point[0]), []
-    for i, rows in enumerate(problem.rows):
-        values = None
-        starts.append(stacked[i] if problem.at_once else None)
-        if stacked[i] is not None:
-            if problem.at_once:
-                values, good = problem.outputs(
-                    i, problem.functions, stacked[i], progress.n
-                )
-            else:
-                values, each = stacked[i]
-                good = jnp.all(each | ~rows.taken(progress.n))
+    saved, between, finite = [], [], tree.all_finite(progress.point[0])
+    all_rows = []
+    for i, (at_steps, inside) in enumerate(stacked):
+        values, ys, rows = None, None, problem.rows[i]
+        if at_steps is not None:
+            if isinstance(problem.steps, VariableSteps):
+                found, at_steps = at_steps
+                rows = rows.found(*found)
+            values, each = at_steps
+            good = jnp.all(each | ~rows.taken(progress.n))
+            if inside is not None:
+                number, (new, ys), nodes = inside
+                ys = number, ys
+                stencils = problem.stencils[i]
+                assert stencils is not None
+                way = stencils.ways.interpolated
+                values, good = tree.where(way, (new, nodes), (values, good))
             finite &= good
         saved.append(values)
+        between.append(ys)
+        all_rows.append(rows)
     success: Any = dfx.RESULTS.successful
     result = success if progress.result is None else progress.result
     bad = (result == success) & ~finite
     result = dfx.RESULTS.where(bad, NONFINITE, result)
     result = problem.explain(progress.n, progress.point, result)
-    short = (result == success) & (progress.n < problem.steps.total)
+    short = (result == success) & ~problem.ended(progress.n, progress.point)
     result = dfx.RESULTS.where(short, dfx.RESULTS.max_steps_reached, result)
-    trace = Trace(progress.n, progress.point, starts, kept)
+    before = progress.before
+    trace = Trace(progress.n, progress.point, between, kept_states, before, all_rows)
     return (progress, result, saved), trace
 
 
-def _track(problem: Problem, i: int) -> Track:
-    rows, output = problem.rows[i], problem.functions.outputs[i]
-    stops = rows.stop, rows.reached(problem.last), problem.last + 1
-    if problem.at_once:
-        return Track(*stops, lambda j, point: point, problem.start)
-    init = output(problem.steps.t0, problem.start[0]), jnp.asarray(True)
-    value = lambda j, point: problem.output(i, problem.functions, j, point)
-    return Track(*stops, value, init)
+def _tracks(
+    problem: Problem, i: int, keep: bool
+) -> tuple[AbstractTrack | None, Interpolated | None]:
+    """What output `i` collects at steps, or by shorter ones, and what between them:
+    values, and the states of which these are if they are to `keep`."""
+    rows, stencils, functions = problem.rows[i], problem.stencils[i], problem.functions
+    if len(rows) == 0:
+        return None, None
+    y, output = problem.start[0], functions.outputs[i]
+    init, due = output(problem.steps.t0, y), rows.reached(problem.last)
+    if isinstance(problem.steps, VariableSteps):
+        found = lambda j, n, inside, point: problem.output(
+            i, functions, j, point, found=(n, inside)
+        )
+        return Timed(rows.time, found, (init, jnp.asarray(True))), None
+    if stencils is not None:
+        due &= stencils.ways.others
+    value = lambda j, point: problem.output(i, functions, j, point)
+    stops = rows.stop, due, problem.last + 1
+    at_steps = Track(*stops, value, (init, jnp.asarray(True)))
+    if stencils is None:
+        return at_steps, None
+    assert functions.node is not None
+    kept = lambda y: y if keep else None
+    value = lambda j, y: (output(rows.time[j], y), kept(y))
+    kinks, init = problem.steps.kinks, (init, kept(y))
+    return at_steps, Interpolated(stencils, kinks, functions.node, value, y, init)
 
 
 def _walk(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
     """All steps, stopping where a value of a track is due."""
     steps, last, meter = problem.steps, problem.last, problem.progress_meter
+    varies, keeps = isinstance(steps, VariableSteps), tracks[1] is not None
 
     def step(progress: Progress) -> Progress:
-        n = progress.n
-        end, result = problem.functions.step(n, progress.point)
-        done = (steps.time(n + 1) - steps.t0) / (steps.t1 - steps.t0)
-        return Progress(n + 1, end, result, meter.step(progress.meter, done))
+        n, point = progress.n, progress.point
+        end, result = problem.functions.step(n, point)
+        done = (problem.time(n + 1, end) - steps.t0) / (steps.t1 - steps.t0)
+        before = point if varies and keeps else None
+        return Progress(n + 1, end, result, meter.step(progress.meter, done), before)
 
-    start = Progress(jnp.asarray(0), problem.start, None, problem.meter)
+    before = problem.start if varies and keeps else None
+    zero = jnp.zeros((), int)
+    start = Progress(zero, problem.start, None, problem.meter, before)
     can_fail = eqx.filter_eval_shape(step, start).result is not None
     if can_fail:
         success = jtu.tree_map(jnp.asarray, dfx.RESULTS.successful)
         start = eqx.tree_at(lambda x: x.result, start, success, is_leaf=_is_none)
 
-    def unfinished(progress: Progress, stop: Array) -> Bool[Array, ""]:
+    def unfinished(
+        progress: Progress, stop: Array, time: Array | None = None
+    ) -> Bool[Array, ""]:
         left = progress.n < stop
+        if isinstance(steps, VariableSteps):
+            left &= ~steps.ended(progress.point)
+            if time is not None:
+                left &= steps.next(progress.point) <= time
         if not can_fail:
             return left
         return left & (progress.result == dfx.RESULTS.successful)
 
-    def advance_to(stop: Array, progress: Progress) -> Progress:
+    def advance_to(
+        stop: Array, progress: Progress, time: Array | None = None
+    ) -> Progress:
         if not (cheap_iterations() or can_fail):
             block = lambda x: lax.fori_loop(0, _BLOCK, lambda _, x: step(x), x)
             several = lambda progress: progress.n + _BLOCK <= stop
             progress = lax.while_loop(several, block, progress)
-        return lax.while_loop(lambda x: unfinished(x, stop), step, progress)
+        return lax.while_loop(lambda x: unfinished(x, stop, time), step, progress)
 
-    is_track = lambda x: isinstance(x, Track)
+    is_track = lambda x: isinstance(x, AbstractTrack)
     flat, structure = jtu.tree_flatten(tracks, is_leaf=is_track)
     due = lambda states: [
-        track.stops[j] for track, (j, _) in zip(flat, states, strict=True)
+        track.due(state) for track, state in zip(flat, states, strict=True)
     ]
+
+    def time(states) -> Array | None:
+        """The next time at which the state is wanted, if steps are not known."""
+        each = [
+            track.time(state)
+            for track, state in zip(flat, states, strict=True)
+            if isinstance(track, Timed)
+        ]
+        return reduce(jnp.minimum, each) if each else None
+
+    def now(progress: Progress, time: Array) -> Bool[Array, ""]:
+        """Whether that is before the end of the next step."""
+        assert isinstance(steps, VariableSteps)
+        point, last = progress.point, steps.t1
+        return (time < steps.next(point)) | (steps.ended(point) & (time <= last))
 
     def stop(x):
         progress, states = x
         wanted = due(states)
         at = reduce(jnp.minimum, wanted, last)
-        progress, new = advance_to(at, progress), []
-        for track, (j, rows), next_stop in zip(flat, states, wanted, strict=True):
-            here = next_stop == at
-            place = jnp.where(here, j, len(track.stops) - 1)
-            rows = _put(rows, place, track.value(j, progress.point))
-            new.append((jnp.where(here, j + 1, j), rows))
+        progress, new = advance_to(at, progress, time(states)), []
+        for track, state, next_stop in zip(flat, states, wanted, strict=True):
+            if isinstance(track, Timed):
+                here = now(progress, track.time(state))
+            else:
+                here = (progress.n if varies else at) == next_stop
+            visit = lambda track=track, state=state: track.visit(
+                state, progress.n if varies else at, progress.point
+            )
+            new.append(lax.cond(here, visit, lambda state=state: state))
         return progress, new
 
     def more(x):
         progress, states = x
-        some = unfinished(progress, last) | (reduce(jnp.minimum, due(states)) <= last)
+        some = unfinished(progress, last)
+        if varies:
+            wanted = time(states)
+            if wanted is not None:
+                good = progress.result == dfx.RESULTS.successful
+                some |= now(progress, wanted) & good
+        else:
+            some |= reduce(jnp.minimum, due(states)) <= last
         # Steps from a state that is not finite are of no use.
         return some & tree.all_finite(progress.point[0])
 
@@ -174,33 +217,27 @@ def _walk(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
         return advance_to(last, start), jtu.tree_unflatten(structure, [])
     # The end is a stop too, so that there is one loop over steps.
     end, states = lax.while_loop(more, stop, (start, states))
-    values = [jtu.tree_map(lambda x: x[:-1], rows) for _, rows in states]
-    return end, jtu.tree_unflatten(structure, values)
+    rows = [track.rows(state) for track, state in zip(flat, states, strict=True)]
+    return end, jtu.tree_unflatten(structure, rows)
 
 
 _is_none = lambda x: x is None
 
 
-def _put(rows: PyTree, i: Array, value: PyTree, here: Any = True) -> PyTree:
-    """Rows with one of them replaced, if it is `here`."""
-
-    def leaf(xs, x):
-        if here is not True:
-            x = jnp.where(here, x, xs[i])
-        return lax.dynamic_update_index_in_dim(xs, cast_to(x, xs), i, 0)
-
-    return jtu.tree_map(leaf, rows, value)
-
-
-def saved_rows(problem: Problem, i: int, buffer, values, progress: Progress):
+def saved_rows(
+    problem: Problem, i: int, rows: Rows, buffer, values, progress: Progress
+):
     """The final times and values of output `i`, from those that Diffrax allocated, and
     the numbers of rows and of times of `ts` that were saved."""
-    (ts, ys), sub, rows, n = buffer, problem.subs[i], problem.rows[i], progress.n
+    (ts, ys), sub, n = buffer, problem.subs[i], progress.n
     steps, output = problem.steps, problem.functions.outputs[i]
     first = int(sub.t0)
     if first:
         value = output(steps.t0, problem.start[0])
-        ts, ys = _put(ts, jnp.asarray(0), steps.t0), _put(ys, jnp.asarray(0), value)
+        ts, ys = (
+            put(ts, jnp.zeros((), int), steps.t0),
+            put(ys, jnp.zeros((), int), value),
+        )
     reached = rows.reached(n)
     if len(rows):
         taken = rows.taken(n)
@@ -215,9 +252,10 @@ def saved_rows(problem: Problem, i: int, buffer, values, progress: Progress):
     if sub.t1:
         separate = end_is_separate(sub, n)
         if separate is not None:
-            value = output(steps.time(n), progress.point[0])
-            ts = _put(ts, number, steps.time(n), separate)
-            ys, number = _put(ys, number, value, separate), number + 1
+            time = problem.time(n, progress.point)
+            value = output(time, progress.point[0])
+            ts = put(ts, number, time, separate)
+            ys, number = put(ys, number, value, separate), number + 1
     return ts, ys, number, jnp.sum(reached & rows.of_ts)
 
 

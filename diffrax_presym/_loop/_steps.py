@@ -4,7 +4,10 @@ from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
+import jax.lax as lax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from .._checks import as_finite
@@ -14,7 +17,7 @@ from .._system._bound import System
 
 
 # More than any solve takes, in integers of either precision.
-_MOST_STEPS = 2**30
+MOST_STEPS = 2**30
 _OTHER_ENDS = (
     "The first and the last time of `diffrax.StepTo(ts)` must be `t0` and `t1` of the "
     "solve. Write `StepTo(jnp.concatenate([t0, ts, t1]))`, or use "
@@ -44,7 +47,7 @@ class StepsBetween(dfx.AbstractStepSizeController):
         ```
     """
 
-    times: Float[Array, " times"]
+    times: Float[Array, " times"]  # sorted
 
     def __init__(self, times):
         """**Arguments:**
@@ -56,15 +59,20 @@ class StepsBetween(dfx.AbstractStepSizeController):
 
         `ValueError` if they are not a vector of finite numbers.
         """
-        self.times = jnp.atleast_1d(as_finite(times, "`StepsBetween(times)`"))
-        if self.times.ndim > 1:
+        given = jnp.atleast_1d(as_finite(times, "`StepsBetween(times)`"))
+        if given.ndim > 1:
             raise ValueError(
                 "`StepsBetween(times)` must be a vector, but got the shape "
-                f"{self.times.shape}."
+                f"{given.shape}."
             )
+        if isinstance(times, Tracer):
+            self.times = jnp.sort(given)
+        else:  # Once, rather than in each solve.
+            self.times = jnp.asarray(np.sort(np.atleast_1d(times)), given.dtype)
 
     def wrap(self, direction):
         times = self.times * cast_to(direction, self.times)
+        times = jnp.where(direction < 0, times[::-1], times)
         return eqx.tree_at(lambda self: self.times, self, times)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
@@ -74,13 +82,13 @@ class StepsBetween(dfx.AbstractStepSizeController):
                 "`diffeqsolve(..., dt0=...)`."
             )
         steps = Steps(self, t0, t1, dt0)
-        return steps.time(jnp.asarray(1)), (jnp.asarray(1), steps)
+        return steps.time(jnp.ones((), int)), (jnp.ones((), int), steps)
 
     def adapt_step_size(
         self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
     ):
         n, steps = controller_state
-        kink, state = jnp.any(steps.first[1:] == n), (n + 1, steps)
+        kink, state = jnp.any(steps.kinks == n), (n + 1, steps)
         return True, t1, steps.time(n + 1), kink, state, dfx.RESULTS.successful
 
 
@@ -107,13 +115,15 @@ class Steps(eqx.Module):
             return
         self.starts, ends = t0[None], t1[None]
         if isinstance(controller, StepsBetween):
-            inner = jnp.clip(jnp.sort(controller.times.astype(t0.dtype)), t0, t1)
+            inner = jnp.clip(controller.times.astype(t0.dtype), t0, t1)
             self.starts = jnp.concatenate([self.starts, inner])
             ends = jnp.concatenate([inner, ends])
-        spans = ends - self.starts
-        # As few equal steps as are not longer than `dt0`, but for rounding.
-        eps, most = float(jnp.finfo(t0.dtype).eps), _MOST_STEPS
-        numbers = jnp.ceil(spans / dt0 * (1 - 2 * eps))
+        spans, most = ends - self.starts, MOST_STEPS
+        # As few equal steps as are not longer than `dt0`, but for the rounding of the
+        # ends of their span.
+        eps = float(jnp.finfo(t0.dtype).eps)
+        rounding = eps * (jnp.abs(self.starts) + jnp.abs(ends) + spans)
+        numbers = jnp.ceil((spans - jnp.minimum(rounding, dt0 / 4)) / dt0)
         # One step if `dt0` is infinite.
         numbers = jnp.where(spans > 0, jnp.maximum(numbers, 1), numbers)
         finite = jnp.isfinite(numbers)
@@ -128,6 +138,11 @@ class Steps(eqx.Module):
     def are_equal(self) -> bool:
         return self.ts is None and len(self.starts) == 1
 
+    @property
+    def kinks(self) -> Int[Array, " kinks"] | None:
+        """The steps that start at one of the given times, if there are any."""
+        return None if len(self.starts) == 1 else self.first[1:]
+
     def _part(self, n: Int[Array, "..."]) -> Any:
         if len(self.starts) == 1:
             return 0
@@ -137,18 +152,72 @@ class Steps(eqx.Module):
         """The start of step `n`."""
         if self.ts is not None:
             return self.ts[n]
-        k = self._part(n)
+        return self._within(self._part(n), n)
+
+    def _within(self, k: Any, n: Int[Array, "..."]) -> Float[Array, "..."]:
+        """The start of step `n`, one of span `k`."""
         t = self.starts[k] + self.length[k] * (n - self.first[k]).astype(self.t0.dtype)
         return jnp.where(n >= self.total, self.t1, t)
+
+    @property
+    def fewest(self) -> Int[Array, ""]:
+        """The least number of steps between two of the given times."""
+        ends = jnp.append(self.first[1:], self.total)
+        counts = ends - self.first
+        return jnp.min(jnp.where(counts > 0, counts, self.total))
+
+    @property
+    def ratio(self) -> Float[Array, ""]:
+        """The largest ratio of neighbouring steps, unless steps may end between."""
+        if self.ts is None:
+            return jnp.ones_like(self.t0)
+        lengths = jnp.diff(self.ts)
+        pair = jnp.abs(jnp.log(lengths[1:] / lengths[:-1]))
+        return jnp.exp(jnp.max(pair, initial=0.0))
+
+    def smooth_part(self, n: Int[Array, " rows"]) -> tuple[Array, Array]:
+        """The first and the last end of steps without one of the given times between,
+        around the starts of steps."""
+        k = self._part(jnp.minimum(n, jnp.maximum(self.total - 1, 0)))
+        return self.first[k], jnp.append(self.first[1:], self.total)[k]
+
+    def lengths(self, n: Int[Array, " rows"]) -> Float[Array, " rows"]:
+        """The lengths of steps, or 1 of one that there is not."""
+        n = jnp.clip(n, 0, jnp.maximum(self.total - 1, 0))
+        if self.ts is None:
+            length = jnp.broadcast_to(self.length[self._part(n)], n.shape)
+        else:
+            length = self.ts[n + 1] - self.ts[n]
+        return jnp.where(length > 0, length, 1)
+
+    def largest_growth(self, system: System, last: Array) -> Float[Array, ""]:
+        """Of errors of `p` by friction, backwards over a step; its logarithm."""
+        friction = system.friction
+        assert friction is not None
+
+        def growth(n: Array) -> Array:
+            t0, t1, h = self.span(system, n)
+            return friction.growth(jnp.minimum(t0, t1), jnp.abs(h))
+
+        if self.are_equal and friction.is_autonomous:
+            return growth(jnp.zeros((), int))
+        body = lambda n, x: jnp.maximum(x, growth(n))
+        return lax.fori_loop(0, last, body, growth(jnp.zeros((), int)))
 
     def span(self, system: System, n: Int[Array, ""]) -> Span:
         """Step `n`, in physical time."""
         # In a batch, members that are done repeat a step, which must not fail.
         n = jnp.maximum(jnp.minimum(n, self.total - 1), 0)
-        t0, t1 = system.time(self.time(n)), system.time(self.time(n + 1))
         if self.ts is not None:
+            t0, t1 = system.time(self.ts[n]), system.time(self.ts[n + 1])
             return Span(t0, t1, t1 - t0)
-        return Span(t0, t1, system.time(self.length[self._part(n)]))
+        k, end = self._part(n), n + 1
+        t0, t1 = self._within(k, n), self._within(k, end)
+        if len(self.starts) > 1:
+            # Found by one search, and the end of the last step in a span to rounding.
+            after = jnp.minimum(k + 1, len(self.starts) - 1)
+            t1 = jnp.where(end == self.first[after], self.starts[after], t1)
+        return Span(*map(system.time, (t0, t1, self.length[k])))
 
     def locate(
         self, ts: Float[Array, " times"]
@@ -187,10 +256,11 @@ class Rows(eqx.Module):
     # measured times, for which nothing is saved.
     stop: Int[Array, " rows"]
     inside: Bool[Array, " rows"]  # whether it is within that step
+    known: Int[Array, " rows"]  # the number of steps after which it is known
     of_ts: Bool[Array, " rows"]  # whether it is of `ts`
     may_be_inside: bool = eqx.field(static=True)
 
-    def __init__(self, sub: dfx.SubSaveAt, steps: Steps, max_steps: int | None):
+    def __init__(self, sub: dfx.SubSaveAt, steps: Any, max_steps: int | None):
         times, stops, insides = [], [], []
         self.may_be_inside = sub.ts is not None and len(sub.ts) > 0
         if sub.ts is not None:
@@ -213,13 +283,25 @@ class Rows(eqx.Module):
             order = jnp.lexsort((~of_ts, jnp.where(stop > steps.total, jnp.inf, time)))
             time, stop, inside, of_ts = (x[order] for x in (time, stop, inside, of_ts))
         self.time, self.stop, self.inside, self.of_ts = time, stop, inside, of_ts
+        self.known = stop + jnp.where(inside, 1, 0)
+
+    def known_after(self, number: Int[Array, " rows"]) -> "Rows":
+        """The same, of which each is known after another number of steps."""
+        return eqx.tree_at(lambda self: self.known, self, number)
+
+    def found(self, stop: Array, inside: Array) -> "Rows":
+        """The same, of which the steps have been found."""
+        gap = jnp.isnan(self.time)
+        stop, inside = jnp.where(gap, -1, stop), inside & ~gap
+        new = stop, inside, stop + jnp.where(inside, 1, 0)
+        return eqx.tree_at(lambda self: (self.stop, self.inside, self.known), self, new)
 
     def __len__(self) -> int:
         return len(self.time)
 
     def reached(self, n: Int[Array, ""]) -> Bool[Array, " rows"]:
         """Which rows are known after `n` steps."""
-        return self.stop + jnp.where(self.inside, 1, 0) <= n
+        return self.known <= n
 
     def taken(self, n: Int[Array, ""]) -> Bool[Array, " rows"]:
         """Which of these have a value."""

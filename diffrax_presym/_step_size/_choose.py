@@ -89,10 +89,14 @@ def choose_step(
     `smooth=False`. Then a smaller number of steps is searched, whose errors are
     measured against the finest solve: about as long as ten solves with the chosen step.
 
-    The step divides the span. A saved time inside of a step costs a step more, as in
-    [`diffrax_presym.FixedStepAdjoint`][]. So if the saved times are on a grid that
-    divides the span, and steps that end at all of them cost no more, such a step is
-    chosen. The error may then be much smaller than aimed at.
+    A parameter that scales steps is found in the same way, such as `epsilon` of
+    [`diffrax_presym.StepDensityController`][]: what `solve` is given is then not a
+    step, but the number of steps that it takes falls as that grows.
+
+    The step divides the span. A saved time inside of a step costs a step more, unless
+    [`diffrax_presym.FixedStepAdjoint`][] interpolates it. So if the saved times are on
+    a grid that divides the span, and steps that end at all of them cost no more, such a
+    step is chosen. The error may then be much smaller than aimed at.
 
     It needs concrete numbers, so it is called outside of `jax.jit`. It knows only the
     solve that it is given: for other parameters choose another step, and in a batch

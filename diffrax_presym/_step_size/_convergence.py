@@ -126,7 +126,10 @@ def find_steps(
         if grid is None and finest.finite:
             # Of a solve that fails, the saved times are not known.
             grid = Grid.of(finest.ts, *times)
+            if finest.steps != n:  # The steps are not those that divide the span.
+                grid = grid._replace(intervals=None)
             numbers = _numbers(grid.intervals or 1, n)
+        grid = grid and grid._replace(is_free=finest.interpolates)
         if law is None or last is None:
             law = Law((), finest, finest.order, tolerances)
             continue

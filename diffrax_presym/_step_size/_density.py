@@ -4,11 +4,13 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike
 
 from .._checks import as_positive, describe
-from .._numbers import as_time, cast_to, Scalar
+from .._numbers import as_time, cast_to, Scalar, State
 from .._results import STEP_DENSITY_INVALID, STEP_DENSITY_MISSED
+from .._system._base import AbstractSystem
 
 
 class StepDensityController(dfx.AbstractStepSizeController):
@@ -30,11 +32,22 @@ class StepDensityController(dfx.AbstractStepSizeController):
 
     For very uneven motion, such as close encounters; with every symmetric one-step
     scheme of this package and any solver of Diffrax. Not for smooth motion, where
-    constant steps are cheaper. For attraction that is unbounded as bodies approach each
-    other take the distance to the power 3/2, by Kepler's third law: a close encounter
-    takes as many steps as a distant one, and `epsilon` of 0.1 is 63 steps for each
-    circular orbit. Of several distances take $\big( \sum_k r_k^{-3} \big)^{-1/2}$.
-    Steps of equal length in phase space have the density $|(\dot q, \dot p)|^{-1}$.
+    constant steps are cheaper. With `FixedStepAdjoint` a saved time takes one step
+    more, of its own length, and gradients are those of the discrete solution, with the
+    dependence of the steps on the states.
+
+    The density may be the system itself. Its time scale is then taken,
+
+    $$\sigma = \Big( \sum_{ij} \Big( \frac{\partial \ddot q_i}{\partial q_j}
+    \Big)^2 \Big)^{-1/4}$$
+
+    with the accelerations $\ddot q$ of all but linear friction: of an oscillation
+    $1 / \omega$, of bodies that attract each other a power 3/2 of the distance, as in
+    Kepler's third law, so that a close encounter takes as many steps as a distant one.
+    It costs as many directional derivatives of the force per step as there are
+    positions. For many bodies give it as a function: of several distances
+    $\big( \sum_k r_k^{-3} \big)^{-1/2}$. `epsilon` of 0.1 is about 63 steps for each
+    period.
 
     Requires `dt0=None`. A solve fails with `RESULTS.step_density_missed` if a step
     differs from $\epsilon \sigma$ at one of its ends by more than a factor of four, as
@@ -56,13 +69,13 @@ class StepDensityController(dfx.AbstractStepSizeController):
     density: Callable
     direction: ArrayLike
 
-    def __init__(self, epsilon: ArrayLike, density: Callable):
+    def __init__(self, epsilon: ArrayLike, density: Callable | AbstractSystem):
         r"""**Arguments:**
 
         - `epsilon`: the step size $\epsilon$ where the density is one; a positive
             number, in units of time if the density has none.
-        - `density`: the step density $\sigma$, a function `density(t, y, args)` that
-            returns a positive scalar; for example
+        - `density`: the step density $\sigma$: the system, whose time scale it is; or a
+            function `density(t, y, args)` that returns a positive scalar, for example
             `lambda t, y, args: jnp.linalg.norm(y[0]) ** 1.5`.
 
         **Raises:**
@@ -71,11 +84,13 @@ class StepDensityController(dfx.AbstractStepSizeController):
         traced if `dt0` is given or the density is not a scalar.
         """
         self.epsilon = as_positive(epsilon, "`StepDensityController(epsilon=...)`")
+        if isinstance(density, AbstractSystem):
+            density = TimeScale(density)
         if not callable(density):
             raise ValueError(
-                "`StepDensityController(density=...)` must be a function `density(t, "
-                f"y, args)`, but got {density!r}. Write for example `lambda t, y, "
-                "args: jnp.linalg.norm(y[0]) ** 1.5`."
+                "`StepDensityController(density=...)` must be a system or a function "
+                f"`density(t, y, args)`, but got {density!r}. Write for example "
+                "`lambda t, y, args: jnp.linalg.norm(y[0]) ** 1.5`."
             )
         self.density = density
         self.direction = 1
@@ -153,6 +168,24 @@ class StepDensityController(dfx.AbstractStepSizeController):
                 "`lambda t, y, args: jnp.linalg.norm(y[0]) ** 1.5`."
             )
         return cast_to(self.epsilon, t) * cast_to(sigma, t)
+
+
+class TimeScale(eqx.Module):
+    """The time scale of a system, of all derivatives of accelerations."""
+
+    system: AbstractSystem
+
+    def __call__(self, t, y: State, args) -> Scalar:
+        q, p = y
+        flat, structure = ravel_pytree(q)
+
+        def acceleration(x):
+            q = structure(x)
+            velocity = lambda p: self.system.velocity(t, q, p, args)
+            force = self.system.force(t, q, p, args)
+            return ravel_pytree(jax.jvp(velocity, (p,), (force,))[1])[0]
+
+        return jnp.sum(jax.jacfwd(acceleration)(flat) ** 2) ** -0.25
 
 
 def _follows(ratio):

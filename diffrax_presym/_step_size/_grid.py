@@ -10,6 +10,7 @@ class Grid(NamedTuple):
 
     intervals: int | None  # `None` if the times are irregular
     at: np.ndarray  # the interval at whose end each time lies
+    is_free: bool = False  # whether times inside of steps cost nothing
 
     @classmethod
     def of(cls, ts: np.ndarray, t0: float, t1: float) -> "Grid":
@@ -23,7 +24,10 @@ class Grid(NamedTuple):
         return cls(number, np.round(where * (number or 1)).astype(int))
 
     def cost(self, steps: np.ndarray) -> np.ndarray:
-        """Of a solve, in steps: a time inside of a step takes a shorter one."""
+        """Of a solve, in steps: a time inside of a step takes a shorter one, unless it
+        is free."""
+        if self.is_free:
+            return steps
         if self.intervals is None:
             return steps + len(self.at)
         # A time is the end of a step if it is so with the steps that divide the grid.

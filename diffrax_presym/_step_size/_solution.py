@@ -21,6 +21,7 @@ class Solution(NamedTuple):
     leaves: list[np.ndarray]  # values, and times
     finite: bool
     order: int | None  # of the scheme, if that is known
+    interpolates: bool = False  # between steps, at no cost
 
     @classmethod
     def of(cls, number: int, solve: Callable[[Array], Any], step) -> "Solution":
@@ -78,6 +79,7 @@ class Solution(NamedTuple):
             [*values, *times],
             finite,
             None if order is None else int(order),
+            bool(sol.stats.get("interpolated", False)),
         )
 
 

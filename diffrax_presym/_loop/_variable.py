@@ -1,0 +1,155 @@
+"""Steps that a controller finds on the way, the same in both directions of time.
+
+The solver state of such a solve has its clock. So a step is a map of the state alone,
+as one of a length that is known, and is undone and differentiated like it: with the
+dependence of all steps on the states before them.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from .._numbers import State
+from .._scheme._base import advance, between, check_step, Point, Scheme
+from .._scheme._engine import backward, first_failure, prepare, Result, Span
+from .._step_size._density import StepDensityController
+from .._system._bound import System
+from ._steps import MOST_STEPS
+from ._tracks import AbstractTrack, put, stack
+
+
+class Clock(NamedTuple):
+    """The time that a solve has come to, and the state of its controller."""
+
+    t: Float[Array, ""]
+    control: Float[Array, ""]
+
+
+class VariableSteps(eqx.Module):
+    """Steps of a controller, from one end of a solve to the other."""
+
+    t0: Float[Array, ""]
+    t1: Float[Array, ""]
+    controller: StepDensityController
+    kinks: None = None  # Nothing is known of jumps.
+
+    @property
+    def total(self) -> Int[Array, ""]:
+        """The largest number of steps: how many there are is not known."""
+        return jnp.asarray(MOST_STEPS)
+
+    def locate(self, ts: Float[Array, " times"]) -> tuple[Array, Array]:
+        """The step in which each time is: not known yet."""
+        return jnp.full(ts.shape, MOST_STEPS), jnp.ones(ts.shape, bool)
+
+    def clock(self, point: Point) -> Clock:
+        return point[1][1]
+
+    def ended(self, point: Point) -> Bool[Array, ""]:
+        return self.clock(point).t >= self.t1
+
+    def next(self, point: Point) -> Float[Array, ""]:
+        """The end of the next step; the last one is cut off at the end of the solve."""
+        t, control = self.clock(point)
+        end = t + self.controller.step_size(control)
+        rounding = 4 * jnp.finfo(t.dtype).eps * jnp.maximum(abs(self.t0), abs(self.t1))
+        return jnp.where(end > self.t1 - rounding, self.t1, end)
+
+    def step(
+        self, scheme: Scheme, system: System, point: Point
+    ) -> tuple[Point, Result]:
+        (y, (carry, (t, control))), end = point, self.next(point)
+        h = jnp.where(end < self.t1, self.controller.step_size(control), end - t)
+        span, start = Span(*map(system.time, (t, end, h))), (y, carry)
+        (y1, carry), result = advance(scheme, system, span, start)
+        result = check_step(scheme, system, span, start, (y1, carry), result)
+        *_, control, failed = self.controller.adapt_step_size(
+            t, end, y, y1, system.args, None, 1, control
+        )
+        return (y1, (carry, Clock(end, control))), first_failure(result, failed)
+
+    def undo(self, scheme: Scheme, system: System, point: Point) -> Point:
+        """The inverse of a step, unless that was cut off."""
+        y, (carry, (t, control)) = point
+        control = self.controller.reverse(t, y, system.args, control)
+        h = self.controller.step_size(control)
+        span = Span(*map(system.time, (t - h, t, h)))
+        data = prepare(scheme.moves, system, span, backward=True)
+        y, carry = backward(scheme.moves, system, span, data, (y, carry))
+        return y, (carry, Clock(t - h, control))
+
+    def shorter(self, scheme: Scheme, system: System, point: Point, t: Array) -> State:
+        """The state at a time within the next step."""
+        y, (carry, clock) = point
+        return between(scheme, system, system.time(clock.t), (y, carry), system.time(t))
+
+
+class Timed(AbstractTrack):
+    """Values at given times, wherever these are in the steps."""
+
+    times: Float[Array, " rows"]
+    # Of the row, the number and the start of its step, and whether it is inside of it.
+    value: Callable[[Array, Array, Array, Point], PyTree]
+    init: PyTree
+
+    def start(self):
+        number = len(self.times)
+        found = jnp.full(number, MOST_STEPS), jnp.ones(number, bool)
+        return jnp.zeros((), int), found, stack(self.init, number)
+
+    def due(self, state):
+        return jnp.asarray(MOST_STEPS)  # by its time
+
+    def time(self, state) -> Float[Array, ""]:
+        """The next time; at once if that is a gap in measured times."""
+        j, *_ = state
+        t = self.times[jnp.minimum(j, len(self.times) - 1)]
+        return jnp.where(
+            j < len(self.times), jnp.where(jnp.isnan(t), -jnp.inf, t), jnp.inf
+        )
+
+    def visit(self, state, n, point):
+        j, (stops, insides), rows = state
+        inside = self.times[j] > point[1][1].t
+        found = stops.at[j].set(n), insides.at[j].set(inside)
+        return j + 1, found, put(rows, j, self.value(j, n, inside, point))
+
+    def rows(self, state):
+        return state[1:]
+
+
+class Kept(AbstractTrack):
+    """The states after every so many steps, as many as there is room for."""
+
+    most: int = eqx.field(static=True)
+    init: Point
+
+    def start(self):
+        zero, one = jnp.zeros((), int), jnp.ones((), int)
+        return zero, one, stack(self.init, self.most)
+
+    def due(self, state):
+        count, every, _ = state
+        return count * every
+
+    def visit(self, state, n, point):
+        count, every, rows = state
+        full = count == self.most
+        half = (self.most + 1) // 2
+        # Every other one is dropped.
+        fewer = lambda x: jnp.concatenate([x[::2], x[half:]])[: self.most]
+        rows = lax.cond(full, lambda: jtu.tree_map(fewer, rows), lambda: rows)
+        count, every = jnp.where(full, half, count), jnp.where(full, 2 * every, every)
+        here = count * every == n  # Not if an odd number was full.
+        rows = put(rows, jnp.minimum(count, self.most - 1), point, here)
+        return jnp.where(here, count + 1, count), every, rows
+
+    def rows(self, state):
+        count, every, rows = state
+        i = jnp.arange(self.most)
+        return jnp.where(i < count, i * every, MOST_STEPS), rows
