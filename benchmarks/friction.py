@@ -241,6 +241,38 @@ def many_times(quick):
         table.row(name, *cells, found[80].over(found[400]))
 
 
+def of_time(quick):
+    """The time of a step with friction that depends on time, over that with a constant
+    rate, of one pendulum."""
+    laws = {
+        "constant": dps.ConstantDamping(0.1),
+        "a function": lambda t: 2 * jnp.log1p(0.1 * t),
+        "two laws": [dps.LogDamping(1.0, shift=10.0), dps.PowerDamping(0.1, 0.5)],
+    }
+    solvers = "PresymplecticLeapfrog", "BlanesMoanRKN4", "TunedRKN6", "BlanesMoan6"
+    y0, steps, calls = (jnp.ones(1), jnp.zeros(1)), 200, {}
+    for name in solvers:
+        for kind, law in laws.items():
+            system = mechanics(lambda t, q, args: -jnp.sum(jnp.cos(q)), law)
+            solve = partial(
+                dfx.diffeqsolve,
+                *(system, SCHEMES[name].solver, 0.0, 20.0, 20.0 / steps),
+                adjoint=dps.FixedStepAdjoint(),
+                max_steps=None,
+            )
+            run = jax.jit(lambda y0, solve=solve: solve(y0).ys)
+            calls[name, kind] = partial(run, y0)
+    found = interleaved(calls, 5 if quick else 101)
+    table = Table(
+        "Friction that depends on time: a step over one with a constant rate",
+        *("scheme:<24", "constant, ns:>12.0f", "a function:>11.1f", "two laws:>9.1f"),
+    )
+    for name in solvers:
+        constant, *more = (found[name, kind] for kind in laws)
+        ratios = (timing.over(constant) for timing in more)
+        table.row(name, 1e9 * constant.median / steps, *ratios)
+
+
 def main():
     parser = command_line(__doc__)
     parser.add_argument("--only", nargs="*", help="names of systems")
@@ -255,6 +287,7 @@ def main():
         compare(chosen, options.quick)
     if not options.only:
         many_times(options.quick)
+        of_time(options.quick)
 
 
 if __name__ == "__main__":

@@ -76,6 +76,108 @@ def test_prepared_friction_solves_its_equation(law, rate):
 # Times that are integers.
 
 
+VARYING = {
+    "smooth": (lambda t: 2 * jnp.log1p(0.1 * t) + 0.1 * jnp.sin(t), True),
+    "of each entry": (
+        lambda t: jnp.array([0.3, -0.2], jnp.result_type(t)) * jnp.log1p(t),
+        True,
+    ),
+    "strong": (lambda t: 8.0 * t, False),
+    "with a kink": (lambda t: jnp.abs(t - 3.3), False),
+    "singular": (lambda t: 3 * jnp.log(t - 3.0), False),
+}
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("name", VARYING)
+def test_friction_over_one_step_is_interpolated(name, sign):
+    """Where that is right to rounding: its decays and integrals by a quadrature."""
+    eta, converges = VARYING[name]
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), harmonic, eta)
+    p = jnp.array([0.7, -1.2])
+    friction = system.fit_friction(p)
+    assert friction is not None
+    t0, h = (3.0, 0.7) if sign > 0 else (3.7, -0.7)
+    found = friction.over_step(t0, h)
+    assert found is not None
+    fast, converged = found
+    assert converged == converges
+    if not converges:
+        return
+    values = lambda t: np.asarray(eta(t)) * np.ones(2)
+    # Also a span back in time.
+    for start, end in ((0.0, 0.15), (0.4, 0.8), (0.9, 0.3), (0.0, 1.0)):
+        t, length = t0 + start * h, (end - start) * h
+        data = fast.prepare(t, length, 6)
+        change, integral = friction.flow(data, p)
+        gained = friction.respond(data, p)
+        first, last = values(t), values(t + length)
+        np.testing.assert_allclose(change, np.expm1(first - last) * p, 0, 4e-15)
+        rows = np.polynomial.legendre.leggauss(30)
+        nodes, weights = t + length * (1 + rows[0]) / 2, length * rows[1] / 2
+        each = np.stack([values(x) for x in nodes])
+        for got, exact in (
+            (integral, weights @ np.exp(first - each)),
+            (gained, weights @ np.exp(each - last)),
+        ):
+            np.testing.assert_allclose(got, exact * p, rtol=2e-14, atol=4e-15)
+
+
+@pytest.mark.parametrize("name", VARYING)
+def test_interpolated_friction_in_a_solve(name):
+    """Also where it is not interpolated in all steps, or in no member of a batch."""
+    eta, _ = VARYING[name]
+    y0 = jnp.array([1.0, 0.5]), jnp.array([0.0, 0.3])
+
+    def end(scale, dtype=jnp.float64):
+        law = lambda t: jnp.asarray(scale, t.dtype) * eta(t).astype(t.dtype)
+        system = dps.MechanicalSystem(dps.QuadraticKinetic(), harmonic, law)
+        cast = lambda x: jax.tree.map(lambda x: jnp.asarray(x, dtype), x)
+        return dfx.diffeqsolve(
+            *(system, dps.TunedRKN6(), *cast((3.1, 5.1)), cast(2.0 / 40), cast(y0)),
+            stepsize_controller=dps.StepsBetween(jnp.array([3.3], dtype)),
+            **{"adjoint": dps.FixedStepAdjoint()},  # pyright: ignore
+        ).ys
+
+    def vf(t, y, scale):
+        rate = jax.jvp(eta, (t,), (1.0,))[1]
+        return np.concatenate([y[2:], -y[:2] - scale * np.asarray(rate) * y[2:]])
+
+    for scale in (1.0, 0.5):
+        exact = scipy.integrate.solve_ivp(
+            *(vf, (3.1, 5.1), np.concatenate(y0), "DOP853"),
+            **{"args": (scale,), "rtol": 1e-12, "atol": 1e-13, "max_step": 0.1},
+        ).y[:, -1]
+        error = lambda ys, exact=exact: np.max(np.abs(np.ravel(ys) - exact))
+        assert error(end(scale)) < (1e-5 if name == "singular" else 3e-8)
+        assert error(end(jnp.float32(scale), jnp.float32)) < 1e-4
+        batch = jax.vmap(end)(jnp.array([scale, 1.0]))
+        assert error([x[0] for x in batch]) < (1e-5 if name == "singular" else 3e-8)
+    h = 1e-6
+    loss = lambda scale: jnp.sum(end(scale)[1])
+    central = (loss(1.0 + h) - loss(1.0 - h)) / (2 * h)
+    np.testing.assert_allclose(jax.grad(loss)(1.0), central, rtol=1e-6)
+
+
+@pytest.mark.parametrize("solver", [dps.TunedRKN6(), dps.Suzuki4()])
+def test_singular_start_with_several_laws(solver):
+    """All is lost at once, after which the decay is constant to rounding."""
+    laws = [dps.LogDamping(3.0), dps.PowerDamping(0.4, 0.5)]
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), harmonic, laws)
+    y0 = jnp.array([1.0, 0.5]), jnp.zeros(2)
+    ys = dfx.diffeqsolve(
+        *(system, solver, 0.0, 3.0, 0.01, y0),
+        max_steps=None,
+        adjoint=dps.FixedStepAdjoint(),
+    ).ys
+    # From rest the motion starts as that without the weaker law: q = q0 (1 - t^2 / 8).
+    vf = lambda t, y: np.concatenate([y[2:], -y[:2] - (3 / t + 0.2 / t**0.5) * y[2:]])
+    t = 1e-6
+    start = np.concatenate([y0[0] * (1 - t**2 / 8), -y0[0] * t / 4])
+    exact = scipy.integrate.solve_ivp(vf, (t, 3.0), start, "LSODA", rtol=1e-11)
+    np.testing.assert_allclose(np.ravel(ys), exact.y[:, -1], rtol=0, atol=1e-3)
+
+
 def test_diagnostics_take_integer_times():
     system = dps.MechanicalSystem(
         dps.QuadraticKinetic(), harmonic, dps.ConstantDamping(0.1)

@@ -12,7 +12,7 @@ from .._forms import fit_form, is_operator
 from .._numbers import cast_to, Time
 from ._base import AbstractFriction, MASS, Mechanics, Parts
 from ._damping import as_numbers, Numbers
-from ._viscous import arrays, needs_mass
+from ._viscous import arrays
 
 
 _COEFFICIENT = "`Drag(coefficient)`"
@@ -61,7 +61,7 @@ class Drag(AbstractFriction):
 
         `ValueError` if a coefficient is not a finite real number; and when the solve is
         traced, if a shape does not fit bodies over the last axis of `p`, or the masses
-        are not known.
+        are not constant.
         """
         self.coefficient = _as_given(coefficient, _COEFFICIENT, "c(t, q, args)")
         if medium is not None:
@@ -71,10 +71,10 @@ class Drag(AbstractFriction):
     def parts(self, mechanics: Mechanics) -> Parts:
         if mechanics.mass_varies:
             raise ValueError(
-                "`Drag` acts on bodies, not on joints. Write the force that it exerts "
-                "on the joints as `force=f`, with a function `f(t, q, v, args)`."
+                "`Drag` acts on bodies of constant mass, `QuadraticKinetic(mass)`. "
+                "Write its force on joints or relativistic particles as `force=f`, "
+                "with a function `f(t, q, v, args)`."
             )
-        needs_mass(mechanics, "Drag")
         return Parts(drags=(self,))
 
     def at(self, t: Time, q: PyTree, args: PyTree) -> "Drag":

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, PyTree
 
 from .._numbers import as_time, Scalar, Time
 from ._leaf import EntryFriction, MatrixFriction, reduce_any
+from ._over_step import FrictionOverStep
 
 
 class Effects(eqx.Module):
@@ -26,7 +27,7 @@ class LinearFriction(eqx.Module):
     Changes rather than new momenta are returned, for compensated summation.
     """
 
-    leaves: PyTree[EntryFriction | MatrixFriction]
+    leaves: PyTree[EntryFriction | MatrixFriction | FrictionOverStep]
     precision: float = eqx.field(static=True)  # the relative rounding of a momentum
 
     def _map(self, method: str, *trees: PyTree) -> PyTree:
@@ -56,6 +57,20 @@ class LinearFriction(eqx.Module):
         is not known in closed form."""
         prepare = lambda leaf: leaf.prepare(t, h, order)
         return Effects(jtu.tree_map(prepare, self.leaves, is_leaf=_is_leaf))
+
+    def over_step(
+        self, t: Time, h: Time
+    ) -> tuple["LinearFriction", Bool[Array, ""]] | None:
+        """The same for spans within a step, faster, and whether it is right to
+        rounding; `None` if it is known in closed form."""
+        if self.is_known:
+            return None
+        replace = lambda leaf: leaf if leaf.is_known else FrictionOverStep(leaf, t, h)
+        leaves = jtu.tree_map(replace, self.leaves, is_leaf=_is_leaf)
+        fast = LinearFriction(leaves, self.precision)
+        leaves = jtu.tree_leaves(leaves, is_leaf=_is_leaf)
+        each = [x.converged for x in leaves if isinstance(x, FrictionOverStep)]
+        return fast, functools.reduce(jnp.logical_and, each)
 
     def fix(self, effects: list[Effects]) -> list[Effects]:
         """What was prepared for many spans at once, to be applied many times: matrices
@@ -119,4 +134,5 @@ class LinearFriction(eqx.Module):
         return reduce_any(self._each("is_singular", t))
 
 
-_is_leaf = lambda x: isinstance(x, EntryFriction | MatrixFriction)
+_LEAVES = EntryFriction | MatrixFriction | FrictionOverStep
+_is_leaf = lambda x: isinstance(x, _LEAVES)

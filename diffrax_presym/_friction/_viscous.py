@@ -29,16 +29,6 @@ _FORMS = (
 )
 
 
-def needs_mass(mechanics: Mechanics, name: str) -> None:
-    if not mechanics.has_mass:
-        raise ValueError(
-            f"`{name}` is friction per velocity, and needs to know the mass. Write the "
-            "kinetic energy as `QuadraticKinetic(mass)`; or write the friction as "
-            "`force=f`, with a function `f(t, q, v, args)` such as "
-            "`lambda t, q, v, args: -C @ v`."
-        )
-
-
 def arrays(form: PyTree, name: str) -> PyTree:
     """What a function returned, as arrays."""
     if form is None:
@@ -54,7 +44,6 @@ class ViscousFriction(AbstractFriction):
     def parts(self, mechanics: Mechanics) -> Parts:
         if mechanics.mass_varies:
             return Parts(forces=(self,))
-        needs_mass(mechanics, "ViscousDamping")
         return Parts((Linear(LinearScale(), self.coefficients, per_velocity=True),))
 
     def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
@@ -70,8 +59,6 @@ class LocalFriction(AbstractFriction):
     def parts(self, mechanics: Mechanics) -> Parts:
         if self.per_velocity and mechanics.mass_varies:
             return Parts(forces=(self,))
-        if self.per_velocity:
-            needs_mass(mechanics, "ViscousDamping")
         return Parts(local=(self,))
 
     def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
@@ -88,13 +75,14 @@ def ViscousDamping(coefficients) -> ViscousFriction | LocalFriction:
     viscous drag, magnetic fields, Coriolis forces.
 
     For friction at a rate, in units of one over time, write
-    [`diffrax_presym.ConstantDamping`][]. For [`diffrax_presym.MechanicalSystem`][] with
-    a kinetic energy of known mass, and [`diffrax_presym.LagrangianSystem`][]. In the
-    first the flow of drift and friction is exact, by $e^{-h C M^{-1}}$ and its
-    integral, so that no scheme loses its order by it. A symmetric positive matrix $C$
-    damps; an antisymmetric one does no work, and the energy is kept: the force
-    $e \, v \times B$ on a charge $e$ in a uniform magnetic field $B$, and the Coriolis
-    force $-2 m \, \Omega \times v$ in a frame that rotates with $\Omega$.
+    [`diffrax_presym.ConstantDamping`][]. For [`diffrax_presym.MechanicalSystem`][] and
+    [`diffrax_presym.LagrangianSystem`][]. In the first, with
+    [`diffrax_presym.QuadraticKinetic`][], the flow of drift and friction is exact, by
+    $e^{-h C M^{-1}}$ and its integral, so that no scheme loses its order by it. A
+    symmetric positive matrix $C$ damps; an antisymmetric one does no work, and the
+    energy is kept: the force $e \, v \times B$ on a charge $e$ in a uniform magnetic
+    field $B$, and the Coriolis force $-2 m \, \Omega \times v$ in a frame that rotates
+    with $\Omega$.
 
     With numbers or arrays the cost is that of
     [`diffrax_presym.ConstantDamping`][]. With matrices and equal steps, in the loop of
@@ -139,7 +127,7 @@ def ViscousDamping(coefficients) -> ViscousFriction | LocalFriction:
     **Raises:**
 
     `ValueError` if a coefficient is not a finite real number or array; and when the
-    solve is traced, if a shape does not fit `p` or the mass is not known.
+    solve is traced, if a shape does not fit `p`.
     """
     if coefficients is None:
         raise ValueError(
