@@ -1,8 +1,5 @@
 import gc
-import os
-import subprocess
 import zlib
-from functools import cache
 
 import jax
 import pytest
@@ -27,21 +24,10 @@ def _memory():
     jax.clear_caches()
 
 
-# Of each test with more parameters than these, a sample is run by `make test`, another
-# one for each commit, and all by `make slow`. `@pytest.mark.variants(n)` changes it.
+# Of each test with more parameters than these, a sample is run by `make test`, and all
+# by `make slow`. `@pytest.mark.variants(n)` changes it. The sample is the same for all
+# commits, so that a test fails by what is changed alone.
 VARIANTS = 2
-
-
-@cache
-def seed() -> int:
-    """The commit, so that each tries another sample."""
-    run = subprocess.run(
-        ["git", "rev-parse", "--short=7", "HEAD"],
-        cwd=os.path.dirname(__file__),
-        capture_output=True,
-        text=True,
-    )
-    return int(run.stdout, 16) if run.returncode == 0 else 0
 
 
 def pytest_addoption(parser):
@@ -52,7 +38,7 @@ def pytest_collection_modifyitems(config, items):
     tests: dict = {}
     for item in items:
         tests.setdefault(item.nodeid.split("[")[0], []).append(item)
-    rank = lambda item: zlib.crc32(f"{seed()} {item.nodeid}".encode())
+    rank = lambda item: zlib.crc32(item.nodeid.encode())
     for first, *others in tests.values():
         marker = first.get_closest_marker("variants")
         number = VARIANTS if marker is None else marker.args[0]

@@ -26,7 +26,6 @@ import numpy as np
 import orders
 import pytest
 from catalogue import claim, offered, Problem, reference, Refused
-from conftest import seed
 from jax.flatten_util import ravel_pytree
 
 import diffrax_presym as dps
@@ -176,6 +175,9 @@ def check_order(run: Run, claimed: float, rounding: float):
     """The slope over the three smallest steps with errors above rounding."""
     solve, errors = run.compiled, {}
     least = 24 if run.row["scheme"].name.startswith("multistep") else 4
+    if run.row["friction"].kink is not None:
+        # The kink ends a step but is not named: interpolation goes across it.
+        least = max(least, 12)
     numbers = [n for n in NUMBERS if n >= least]
     if run.way.prescribed:
         numbers = [12, 16, 24]
@@ -379,9 +381,9 @@ ENTRIES = set(os.environ.get("ENTRIES", "").split("|")) - {""}
 
 
 def sample() -> list[dict]:
-    """Some rows, others for each commit, that have as many entries as possible."""
+    """Some rows that have as many entries as possible."""
     rest = [x for x in covering() if {*map(str, x.values())} >= ENTRIES]
-    random.Random(seed()).shuffle(rest)
+    random.Random(0).shuffle(rest)
     entries = lambda row: set(map(str, row.items()))
     chosen, seen = [], set()
     for _ in range(min(SAMPLE, len(rest))):
@@ -418,7 +420,7 @@ def test_refusals(scheme, record_property):
 def test_some_refusals(record_property):
     everything = [x for some in refusals().values() for x in some]
     number = min(20 * SAMPLE, len(everything))
-    for refusal in random.Random(seed()).sample(everything, number):
+    for refusal in random.Random(0).sample(everything, number):
         check_refusal(*refusal)
     record_property("refused", number)
     for scheme, wrapper in itertools.product(catalogue.SCHEMES, catalogue.WRAPPERS):
