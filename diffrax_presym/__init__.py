@@ -45,12 +45,21 @@ from ._step_size._choose import (
 )
 from ._step_size._density import StepDensityController as StepDensityController
 from ._system._bregman import BregmanHamiltonian as BregmanHamiltonian
+from ._system._constrained import ConstrainedSystem as ConstrainedSystem
 from ._system._energy import Hamiltonian as Hamiltonian
 from ._system._kinetic import (
     QuadraticKinetic as QuadraticKinetic,
     RelativisticKinetic as RelativisticKinetic,
 )
 from ._system._lagrangian import LagrangianSystem as LagrangianSystem
+from ._system._manifold import ManifoldSystem as ManifoldSystem
+from ._system._manifolds import (
+    Attitude as Attitude,
+    Euclidean as Euclidean,
+    rotation_matrix as rotation_matrix,
+    Sphere as Sphere,
+    Stiefel as Stiefel,
+)
 from ._system._mechanical import MechanicalSystem as MechanicalSystem
 from ._system._mirror import (
     EntropyMirror as EntropyMirror,

@@ -1,16 +1,22 @@
 """Linear maps in the forms that users write: masses, stiffnesses, friction."""
 
 import equinox as eqx
+import jax
+import jax.lax as lax
 import jax.numpy as jnp
+import jax.scipy.linalg as jsl
 import jax.tree_util as jtu
 import lineax as lx
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Inexact, PyTree
 
 from ._checks import as_finite, as_parameter, as_positive
 from ._numbers import cast_to
 
+
+Vector = Inexact[Array, " n"]
+Matrix = Inexact[Array, "n n"]
 
 _NEGATIVE = (
     " For a negative effective mass write the kinetic energy as a function "
@@ -172,13 +178,65 @@ def divide(form, x: PyTree, name: str, state: str, symmetric=True) -> PyTree:
         _check_symmetric(symmetric, name)
         return lx.linear_solve(form, x, throw=False).value
 
-    def solve(form, x):
-        operator = lx.MatrixLinearOperator(form, lx.positive_semidefinite_tag)
-        return lx.linear_solve(operator, x, lx.Cholesky(), throw=False).value
-
     def leaf(x, form):
         if not is_matrix(form, x):
             return x / form
-        return jnp.vectorize(solve, signature="(n,n),(n)->(n)")(form, x)
+        return jnp.vectorize(solve_positive, signature="(n,n),(n)->(n)")(form, x)
 
     return jtu.tree_map(leaf, x, fit_form(form, x, name, state, symmetric))
+
+
+# The fastest factorisation depends on the size: written out in full, which for more
+# entries takes long to compile; a loop; and LAPACK, which takes long to call.
+_SMALL, _LARGE = 4, 16
+
+
+@jax.jit  # Outside of a solve, a loop would be compiled again by each call.
+def solve_positive(M: Matrix, p: Vector) -> Vector:
+    """The solution of `M v = p`, NaN if `M` is not positive definite."""
+    # The derivative is that of the solution, not of the steps to it.
+    return lax.custom_linear_solve(
+        lambda v: matvec(M, v), p, lambda _, p: _by_size(M, p), symmetric=True
+    )
+
+
+def _by_size(M: Matrix, p: Vector) -> Vector:
+    """The same without derivatives, by the fastest factorisation of this size."""
+    n = len(p)
+    if n > _LARGE:
+        L = jnp.linalg.cholesky(M, symmetrize_input=False)
+        return jsl.cho_solve((L, True), p)
+    if n > _SMALL:
+        return _eliminate(M, p)
+    # Cholesky's factorisation, scalar by scalar.
+    L = [[M[i, j] for j in range(i + 1)] for i in range(n)]
+    v = [p[i] for i in range(n)]
+    inverse = []
+    for j in range(n):
+        for i in range(j, n):
+            for k in range(j):
+                L[i][j] = L[i][j] - L[i][k] * L[j][k]
+        inverse.append(1 / jnp.sqrt(L[j][j]))
+        for i in range(j + 1, n):
+            L[i][j] = L[i][j] * inverse[j]
+    for i in range(n):
+        for k in range(i):
+            v[i] = v[i] - L[i][k] * v[k]
+        v[i] = v[i] * inverse[i]
+    for i in reversed(range(n)):
+        for k in range(i + 1, n):
+            v[i] = v[i] - L[k][i] * v[k]
+        v[i] = v[i] * inverse[i]
+    return jnp.stack(v)
+
+
+def _eliminate(M: Matrix, p: Vector) -> Vector:
+    """By Gauss--Jordan elimination, which needs no pivots if `M` is definite."""
+    rows = jnp.arange(len(p))[:, None]
+
+    def eliminate(k, A):
+        row = A[k] / jnp.where(A[k, k] > 0, A[k, k], jnp.nan)
+        return jnp.where(rows == k, row[None], A - jnp.outer(A[:, k], row))
+
+    A = jnp.concatenate([M, p[:, None]], axis=1)
+    return lax.fori_loop(0, len(p), eliminate, A)[:, -1]

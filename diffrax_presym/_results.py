@@ -38,6 +38,13 @@ NOT_CONVERGED = _entry(
     "`PresymplecticGauss(stages, optimistix.Newton(rtol, atol))`. With `throw=False` "
     "the last finite time in `ts` of `SaveAt(steps=True)` is the end of that step.",
 )
+FORCE_NOT_SOLVED = _entry(
+    "force_not_solved",
+    "The equation of a kick by a `force` of the velocity was not solved, or the state "
+    "left the finite numbers: the force is too stiff for the step, whose length times "
+    "its slope by momentum must be below about 2. Take shorter steps, or use "
+    "`PresymplecticGauss(stages, optimistix.Newton(rtol, atol))`.",
+)
 ROOT_NOT_FOUND = _entry(
     "root_not_found",
     "The root finder of `PresymplecticGauss` did not find the stages of a step: the "
@@ -58,6 +65,28 @@ OTHER_HISTORY = _entry(
     "The `solver_state` is the history of another solution: its momentum is not that "
     "of `y0`. Pass the `solver_state` of the solve whose final state is `y0`, or pass "
     "`made_jump=True`, or omit it.",
+)
+OFF_MANIFOLD = {
+    most: _entry(
+        f"off_manifold_{most:.0e}",
+        f"The initial state is off the manifold of the system by more than {most:.0e}, "
+        "in positions, or in velocities, off its tangent space: by "
+        "`system.violation(t0, *y0, args)`. Pass `system.project(t0, y0, args)`.",
+    )
+    for most in (1e-8, 1e-5, 1e-2, 10.0)
+}
+CONSTRAINT_NOT_SOLVED = _entry(
+    "constraint_not_solved",
+    "Newton's method did not find the multipliers of the constraints in a step: the "
+    "step is too long for the curvature of the constraint, the state left the finite "
+    "numbers, or the constraints are redundant, which `system.project(t0, y0, args)` "
+    "detects. Take shorter steps.",
+)
+NOT_REVERSIBLE = _entry(
+    "constraint_not_reversible",
+    "The inverse of a step does not end where the step started: there are several "
+    "positions on the constraint along its normals, and Newton's method found "
+    "different ones. Take shorter steps.",
 )
 STEP_DENSITY_MISSED = _entry(
     "step_density_missed",

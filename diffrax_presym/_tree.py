@@ -4,6 +4,7 @@ from typing import TypeVar
 
 import equinox as eqx
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Bool, PyTree
@@ -78,9 +79,25 @@ def scale(c: ArrayLike, y: PyTree) -> PyTree:
     return jtu.tree_map(lambda yi: cast_to(c, yi) * yi, y)
 
 
+@jax.custom_batching.custom_vmap
+def any_member(x: Bool[Array, ""]) -> Bool[Array, ""]:
+    """Whether it is true for any member of a batch, the same for all of them."""
+    return x
+
+
+@any_member.def_vmap
+def _(axis_size, in_batched, x):
+    return any_member(jnp.any(x, axis=0)), False
+
+
 def invalid_if(bad: Bool[Array, ""], y: PyTree) -> PyTree:
     """`y`, or NaN if it is `bad`: a product, so that its gradient is NaN too."""
     return scale(jnp.where(bad, jnp.nan, 1.0), y)
+
+
+def stop_gradient(x: PyTree) -> PyTree:
+    arrays, other = eqx.partition(x, eqx.is_array)
+    return eqx.combine(lax.stop_gradient(arrays), other)
 
 
 def zeros(x: PyTree) -> PyTree:

@@ -49,7 +49,8 @@ class System:
     q: Any
     p: Any
     offers: frozenset[str]  # the splits that it offers without friction
-    # The friction that it takes: "all", "rates", "joints", "one rate" or "none".
+    # The friction that it takes: "all", "velocities", "rates", "joints", "one rate" or
+    # "none".
     takes: str
     mass: Any = None
     bodies: bool = False  # whether the last axis are the coordinates of bodies
@@ -328,16 +329,16 @@ SYSTEMS = [
     ),
     System(
         *("relativistic", _mechanical(dps.RelativisticKinetic(1.0, 2.0), _coupled)),
-        *(_relativistic_velocity, _coupled_force, *_TWO, SPLIT, "rates"),
+        *(_relativistic_velocity, _coupled_force, *_TWO, SPLIT, "velocities"),
     ),
     System(
         *("any T and V", _mechanical(_driven_kinetic, _driven), _driven_velocity),
-        *(_driven_force, *_TWO, SPLIT, "rates"),
+        *(_driven_force, *_TWO, SPLIT, "velocities"),
     ),
     System(
         "any T, springs",
         _mechanical(_smooth_kinetic, dps.QuadraticPotential(_SPRINGS)),
-        *(_smooth_velocity, _spring_force, *_TWO, ALL, "rates"),
+        *(_smooth_velocity, _spring_force, *_TWO, ALL, "velocities"),
     ),
     System(
         *("any energy", _energy(_mixed), _mixed_velocity, _mixed_force),
@@ -632,6 +633,13 @@ FRICTION = [
         external=_any_force,
     ),
     Friction(
+        "[constant, place, force]",
+        _same(dps.ConstantDamping(0.4), dps.PositionDamping(_place_rate)),
+        _sum(_constant_force, _by_place, lambda s, t, q, p, v: -0.3 * v - 0.1 * v**3),
+        "force",
+        external=_any_force,
+    ),
+    Friction(
         "[constant, 2 / (t + 1)]",
         _same(dps.ConstantDamping(0.4), dps.LogDamping(2.0, 1.0)),
         *(_rate(lambda t: 0.4 + 2 / (t + 1)), "one rate"),
@@ -843,15 +851,17 @@ def offered(system: System, friction: Friction) -> frozenset[str] | Refused:
         return Refused("one rate")
     if system.takes == "joints":
         return Refused("not of joints") if friction.needs == "bodies" else frozenset()
-    if friction.needs and system.mass is None:
+    if friction.needs == "mass" and system.takes == "velocities":
+        kind = "force"
+    elif friction.needs and system.mass is None:
         return Refused("no mass")
     if friction.name == "operator" and np.shape(system.q) != (system.size,):
         return Refused("not one vector")
     if friction.needs == "bodies" and not system.bodies:
         return frozenset()  # without a closed form, it is a force
-    if kind == "force":
+    if kind == "force" and system.takes == "rates":
         return frozenset()
-    if kind in ("place", "drag"):
+    if kind in ("force", "place", "drag"):
         return system.offers & {"any"}
     constant = friction.constant and kind == "one rate"
     return system.offers - (frozenset() if constant else {"shared", "linear"})
@@ -1143,6 +1153,9 @@ PRECISIONS = ["float64", "float32"]
 ELSEWHERE = {
     "StepDensityController",  # step_density
     *("ChosenStep", "FixedStepAdjoint", "StepsBetween"),  # choose_step, adjoint
+    # Random neighbours of their states, as gradients here take, are not states.
+    "ConstrainedSystem",  # constrained
+    *("Attitude", "Euclidean", "ManifoldSystem", "Sphere", "Stiefel"),  # manifolds
     "MirrorMap",  # bregman
     *("Splitting", "SplittingTableau"),  # tableaus
 }

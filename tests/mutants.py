@@ -209,10 +209,45 @@ MUTANTS = [
     # The loop and its gradient.
     Mutant(
         "a saved row is shifted by one",
-        "_loop/_problem.py",
-        "stop = jnp.where(some, rows.stop[row], 0)",
-        "stop = jnp.where(some, rows.stop[row] - 1, 0)",
-        ("times",),
+        "_loop/_tracks.py",
+        "y = self.stencils.combine(j, ring)",
+        "y = self.stencils.combine(jnp.maximum(j - 1, 0), ring)",
+        tests="test_between_steps.py",
+    ),
+    Mutant(
+        "the second derivative at a node is that in another unit of time",
+        "_loop/_nodes.py",
+        "(d * unit) ** 2 / 2 * cube",
+        "d * d * unit / 2 * cube",
+        tests="test_between_steps.py",
+    ),
+    Mutant(
+        "nodes are those of both sides of a kink",
+        "_loop/_nodes.py",
+        "first = jnp.maximum(first, low)",
+        "first = jnp.maximum(first, 0)",
+        tests="test_between_steps.py",
+    ),
+    Mutant(
+        "values between steps are interpolated whatever the friction",
+        "_loop/_nodes.py",
+        "yes &= growth <= _MOST_FRICTION",
+        "yes &= growth < jnp.inf",
+        tests="test_between_steps.py",
+    ),
+    Mutant(
+        "the derivatives at a kink are those after it",
+        "_loop/_tracks.py",
+        "node = self.node(n, -kink, point)",
+        "node = self.node(n, kink, point)",
+        tests="test_between_steps.py",
+    ),
+    Mutant(
+        "the cotangent of a node is not cleared",
+        "_loop/_backward.py",
+        "return at, put(bars, n % NODES, _zeros(bar))",
+        "return at, bars",
+        tests="test_between_steps.py",
     ),
     Mutant(
         "a saved time is that of the end of its step",
@@ -337,8 +372,8 @@ MUTANTS = [
     Mutant(
         "the cotangent of the last of the rows is dropped",
         "_loop/_backward.py",
-        "[jnp.sum(rows.reached(n)) for rows in problem.rows]",
-        "[jnp.sum(rows.reached(n)) - 1 for rows in problem.rows]",
+        "number = jnp.sum(problem.rows[i].reached(backward.trace.n))",
+        "number = jnp.sum(problem.rows[i].reached(backward.trace.n)) - 1",
         ("times", "reversal"),
     ),
     Mutant(

@@ -553,14 +553,9 @@ HAMILTONIANS = {
         for name, law in {
             "numbers": dps.ConstantDamping(VECTOR),
             "a function of several numbers": lambda t: VECTOR * t,
+            "friction per velocity": dps.ViscousDamping(1.0),
+            "drag": dps.Drag(1.0),
         }.items()
-    },
-    **{
-        f"damping of the paper's family, {type(law).__name__}": (
-            lambda law=law: dps.DissipativeHamiltonian(KINETIC, harmonic, DAMPING, law),
-            Mistake("is friction per velocity", "needs to know the mass", "`force=f`"),
-        )
-        for law in (dps.ViscousDamping(1.0), dps.Drag(1.0))
     },
     "damping of the general family by a number": (
         lambda: dps.DissipativeHamiltonian(KINETIC, harmonic, DAMPING, 0.2),

@@ -328,7 +328,7 @@ def test_steps_for_a_fast_force_and_for_times_in_single_precision():
     ts = np.linspace(0, 10, 101, dtype=np.float32)
     system = mechanical(dps.ConstantDamping(0.1))
     rough = lambda dt0: solve_by(dt0, jnp.float32, dfx.SaveAt(ts=jnp.asarray(ts)))
-    assert dps.choose_step(jax.jit(rough), 0.0, 10.0, rtol=1e-3, atol=1e-3).on_grid
+    assert dps.choose_step(jax.jit(rough), 0.0, 10.0, rtol=1e-3, atol=1e-3).steps < 20
     batch = jax.vmap(solve_by, axis_size=2, in_axes=None)
     with pytest.raises(ValueError, match="most difficult member"):
         dps.choose_step(batch, 0.0, 10.0, rtol=1e-3, atol=1e-3)

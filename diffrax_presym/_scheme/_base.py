@@ -2,7 +2,7 @@ import abc
 import bisect
 import math
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -14,7 +14,6 @@ from .. import _tree as tree
 from .._interpolation import HermiteInterpolation, inner_points
 from .._numbers import cast_to, State
 from .._results import NONFINITE
-from .._system._base import check_state
 from .._system._bound import bind, System, unwrap
 from ._engine import first_failure, forward, Moves, prepare, Result, Span
 from ._failure import explain, unless_too_strong
@@ -41,6 +40,8 @@ class Scheme(NamedTuple):
     has_history: bool = False
     # Whether a step solves equations by iteration.
     is_implicit: bool = False
+    # Whether the ends of steps show the motion between them.
+    is_resolved: bool = True
     # Why steps of unequal length must not be composed: these cancel errors only if the
     # errors are even in the step size.
     not_composable: str | None = None
@@ -48,6 +49,7 @@ class Scheme(NamedTuple):
     check: Callable[[System, Array, State, PyTree], dfx.RESULTS] | None = None
     # The most friction over a step that it resolves.
     most_friction: float = math.inf
+    failure: Any = NONFINITE  # the reason if a state is not finite
     # The maps that it consists of, if these are known.
     pattern: Pattern = ()
 
@@ -81,8 +83,8 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver):
         or would lose its order."""
 
     def init(self, terms, t0, t1, y0, args) -> PyTree:
-        unwrap(terms)  # An error if it is another term.
-        check_state(y0)
+        term, _ = unwrap(terms)  # An error if it is another term.
+        term.check_state(y0)
         system = bind(terms, args, y0)
         return self.scheme(system).start(system, system.time(t0), y0)
 
@@ -106,13 +108,8 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver):
         span = Span(t0, t1, t1 - t0)
         start = y0, carry
         end, result = advance(scheme, system, span, start)
-        finite = dfx.RESULTS.where(
-            tree.all_finite(end[0]), dfx.RESULTS.successful, NONFINITE
-        )
         info = dense_info(self, scheme, system, span, start, end)
-        result = first_failure(result, finite)
-        ends = (t0, start), (t1, end)
-        result = explain(scheme, system, lambda _: span, 1, ends, result)
+        result = check_step(scheme, system, span, start, end, result)
         return end[0], None, info, end[1], result
 
     def func(self, terms, t0, y0, args):
@@ -128,6 +125,18 @@ def advance(
         data = unless_too_strong(scheme.most_friction, system, span, data)
     end, result = forward(scheme.moves, system, span, data, start)
     return end, first_failure(result, system.check(span.t1, system.values(end[0])))
+
+
+def check_step(
+    scheme: Scheme, system: System, span: Span, start: Point, end: Point, result: Result
+) -> dfx.RESULTS:
+    """The result of a step, a failure also if its end is not finite."""
+    finite = dfx.RESULTS.where(
+        tree.all_finite(end[0]), dfx.RESULTS.successful, NONFINITE
+    )
+    result = first_failure(result, finite)
+    ends = (span.t0, start), (span.t1, end)
+    return explain(scheme, system, lambda _: span, 1, ends, result)
 
 
 def between(scheme: Scheme, system: System, t0: Array, start: Point, t: Array) -> State:
@@ -161,6 +170,16 @@ def dense_info(
         return y, tree.scale(h, system.slope(t, y))
 
     return info | dict(inner=lax.map(at, cast_to(inner_points(number), h)))
+
+
+def refuse_constrained(solver: AbstractPresymplecticSolver, system: System) -> None:
+    """An error if the states of a system lie on a manifold that a scheme leaves."""
+    if system.term.is_constrained:
+        raise ValueError(
+            f"`{type(solver).__name__}` would leave the manifold of this "
+            f"`{system.name}`. Use `Strang()`, `BlanesMoan4()` or `BlanesMoan6()`, or "
+            "compositions such as `SofroniouSpaletta(6, Strang())`."
+        )
 
 
 def check_base(base) -> None:

@@ -21,6 +21,7 @@ from jaxtyping import Array, PyTree
 
 from .. import _tree as tree
 from .._friction._linear import Effects
+from .._friction._over_step import NODES
 from .._numbers import cast_to
 from .._system._bound import System
 
@@ -139,6 +140,40 @@ def is_autonomous(moves: Moves, system: System) -> bool:
 
 def prepare(moves: Moves, system: System, span: Span, backward: bool = False) -> PyTree:
     """What all moves need of time alone, for a step: of the inverses if `backward`."""
+    exact = lambda: _prepare(moves, system, span, backward)
+    if system.friction is None or _number(moves) <= NODES:
+        return exact()
+    first, last = _extent(moves)
+    whole = span.part(first, last, last - first)
+    found = system.friction.over_step(whole.t0, whole.h)
+    if found is None:
+        return exact()
+    friction, converged = found
+    fast = eqx.tree_at(lambda system: system.friction, system, friction)
+    # Of a batch as one: otherwise each member would compute both.
+    all_converged = ~tree.any_member(~converged)
+    return lax.cond(all_converged, lambda: _prepare(moves, fast, span, backward), exact)
+
+
+def _number(moves: Moves) -> int:
+    """Of moves in a step."""
+    if not isinstance(moves, Stages):
+        return 1
+    return len(moves.table) * sum(map(_number, moves.moves))
+
+
+def _extent(moves: Moves) -> tuple[float, float]:
+    """The first and the last time of any move, in units of the step."""
+    if not isinstance(moves, Stages):
+        return 0.0, 1.0
+    times = [0.0, 1.0]
+    for i, move in enumerate(moves.moves):
+        for start, end, _ in moves.table[:, i]:
+            times += [start + x * (end - start) for x in _extent(move)]
+    return float(min(times)), float(max(times))
+
+
+def _prepare(moves: Moves, system: System, span: Span, backward: bool) -> PyTree:
     if not isinstance(moves, Stages):
         return moves.prepare(system, span.reversed if backward else span)
 
@@ -151,7 +186,7 @@ def prepare(moves: Moves, system: System, span: Span, backward: bool = False) ->
 
         def one(*row) -> PyTree:
             part = span.part(*row)
-            data = prepare(move, system, part, backward)
+            data = _prepare(move, system, part, backward)
             returns = not backward and np.any(rows[:, 1] < rows[:, 0])
             return _unless_amplified(system, part, data) if returns else data
 
@@ -187,8 +222,7 @@ def _unless_amplified(system: System, span: Span, data: PyTree) -> PyTree:
     friction amplifies rounding errors there beyond half of the digits."""
     if system.friction is None:
         return data
-    arrays, other = eqx.partition(system.friction, eqx.is_array)
-    friction = eqx.combine(lax.stop_gradient(arrays), other)
+    friction = tree.stop_gradient(system.friction)
     bad = friction.growth(span.t1, -span.h) > -math.log(friction.precision) / 2
     return tree.invalid_if(bad, data)
 

@@ -5,14 +5,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import diffrax as dfx
-import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 from .. import _tree as tree
 from .._numbers import State
-from .._results import _SUCCESSFUL, FRICTION_TOO_STRONG, NONFINITE
+from .._results import _SUCCESSFUL, FRICTION_TOO_STRONG, NONFINITE, OFF_MANIFOLD
 from .._system._bound import System
 from ._engine import Span
 
@@ -22,8 +21,7 @@ def _is_too_strong(most: float, system: System, span: Span) -> Bool[Array, ""] |
     it never is."""
     if system.friction is None or most == math.inf:
         return None
-    arrays, other = eqx.partition(system.friction, eqx.is_array)
-    friction = eqx.combine(lax.stop_gradient(arrays), other)
+    friction = tree.stop_gradient(system.friction)
     return friction.over(span.t0, span.h) > most
 
 
@@ -53,6 +51,15 @@ def explain(
             more = lambda i: failed & (i < n) & ~bad(i)
             found = failed & (lax.while_loop(more, lambda i: i + 1, first) < n)
         result = dfx.RESULTS.where(found, FRICTION_TOO_STRONG, result)
+    result = dfx.RESULTS.where(result == NONFINITE, scheme.failure, result)
+    off = system.term.violation(ends[0][0], *tree.values(ends[0][1][0]), system.args)
+    if off is not None:
+        failure = _SUCCESSFUL
+        least = float(jnp.finfo(off.dtype).eps) ** 0.5
+        for most, entry in OFF_MANIFOLD.items():
+            failure = dfx.RESULTS.where(off > max(most, least), entry, failure)
+        # Whatever else failed, failed for this reason.
+        result = dfx.RESULTS.where(failure == _SUCCESSFUL, result, failure)
     if scheme.check is not None:
         for t, point in ends:
             failure = scheme.check(system, t, *point)

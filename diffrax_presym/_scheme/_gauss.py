@@ -12,19 +12,18 @@ from jaxtyping import Array, Inexact, PyTree
 
 from .. import _tree as tree
 from .._checks import check_root_finder
+from .._implicit import contract, implicit
 from .._numbers import cast_to, State
 from .._system._bound import System
-from ._base import AbstractPresymplecticSolver, Scheme
+from ._base import AbstractPresymplecticSolver, refuse_constrained, Scheme
 from ._collocation import gauss_table, legendre, MAX_STAGES
 from ._engine import AbstractMove, Outcome, Span, Stage
 from ._gauss_solve import (
     by_root_finder,
-    contract,
     factorise,
     fixed_point,
     Frames,
     GaussStep,
-    implicit,
     matrix_product,
     Slopes,
 )
@@ -262,6 +261,7 @@ class PresymplecticGauss(AbstractPresymplecticSolver):
         return 2 * self.stages
 
     def scheme(self, system: System) -> Scheme:
+        refuse_constrained(self, system)
         limits = self.max_iterations, self.tolerance
         move = Collocation(self.stages, self.root_finder, *limits)
 

@@ -16,6 +16,7 @@ from jaxtyping import Array, Inexact, PyTree, Shaped
 
 from .. import _tree as tree
 from .._friction._linear import Effects
+from .._implicit import largest_change, lowest
 from .._numbers import cast_to, Scalar, State
 from .._results import NOT_CONVERGED, ROOT_NOT_FOUND
 from .._system._bound import System
@@ -101,27 +102,6 @@ def matrix_product(matrix, x):
     )
 
 
-@eqx.filter_custom_jvp
-def implicit(step: GaussStep, guess: Slopes, *, find, tangent):
-    """The slopes that `find(step, guess)` returns, and its result, with the derivatives
-    of the implicit function."""
-    return find(step, guess)
-
-
-@implicit.def_jvp
-def _implicit_jvp(primals, tangents, *, find, tangent):
-    (step, _), (changes, _) = primals, tangents
-    slopes, result = implicit(*primals, find=find, tangent=tangent)
-    is_none = lambda x: x is None
-    moves = jtu.tree_map(lambda x: x is not None, changes, is_leaf=is_none)
-    moving, fixed = eqx.partition(step, moves)
-    residual = lambda moving: eqx.combine(moving, fixed).residual(slopes)
-    _, explicit = jax.jvp(residual, (moving,), (changes,))
-    _, linear = jax.linearize(step.residual, slopes)
-    change = tangent(linear, tree.scale(-1, explicit))
-    return (slopes, result), (change, jtu.tree_map(lambda _: None, result))
-
-
 class _Search(NamedTuple):
     """The state of a fixed-point iteration."""
 
@@ -163,14 +143,14 @@ def fixed_point(max_iterations: int, tolerance: float, step: GaussStep, guess: S
     dtype = step.h.dtype
     number = lambda x: jnp.asarray(x, dtype)
     nothing = jtu.tree_map(jnp.zeros_like, guess)
-    eps = float(jnp.finfo(_lowest(guess)).eps)
+    eps = float(jnp.finfo(lowest(guess)).eps)
     negligible = max(_NEGLIGIBLE, tolerance / eps)
 
     def iterate(search: _Search) -> _Search:
         _, count, last, before, least, stalled, fresh, *both = search.record
         slopes = step.slopes(search.stages)
         stages = step.stages(slopes)
-        change = _change(stages, search.stages, dtype)
+        change = largest_change(stages, search.stages, dtype)
         moved = [
             (tree.largest(tree.sub(x, y)) / (eps * tree.largest(x))).astype(dtype)
             for x, y in zip(stages, search.stages, strict=True)
@@ -229,54 +209,8 @@ def by_root_finder(
     return solution.value, results.where(found, results.successful, ROOT_NOT_FOUND)
 
 
-def _lowest(x: PyTree):
-    """The lowest precision of the leaves."""
-    dtypes = [leaf.dtype for leaf in jtu.tree_leaves(x)]
-    return max(dtypes, key=lambda dtype: float(jnp.finfo(dtype).eps))
-
-
-def _change(x: PyTree, y: PyTree, dtype) -> Inexact[Array, ""]:
-    """The largest difference, in units of rounding of the largest entry of a leaf."""
-
-    def leaf(x, y):
-        info = jnp.finfo(x.dtype)
-        size = float(info.eps) * jnp.max(jnp.abs(x), initial=0)
-        change = jnp.max(jnp.abs(x - y), initial=0)
-        return (change / jnp.maximum(size, float(info.tiny))).astype(dtype)
-
-    return jtu.tree_reduce(jnp.maximum, jtu.tree_map(leaf, x, y), jnp.zeros((), dtype))
-
-
-def contract(g, y: Slopes) -> Slopes:
-    """Solve a linear system of a residual by the same iteration."""
-
-    def solve(g, b):
-        # x = x + g(x) - b
-        def iterate(state):
-            x, _, _, least, stalled, count = state
-            new = tree.sub(tree.sum(x, g(x)), b)
-            change = _change(new, x, least.dtype)
-            stalled = jnp.where(change < least, 0, stalled + 1)
-            return new, change, state[1], jnp.minimum(change, least), stalled, count + 1
-
-        def going(state):
-            # A contraction that rotates may grow for some iterations.
-            _, change, _, _, stalled, count = state
-            return ~(change <= 1 / 8) & (stalled < 10) & (count < 200)
-
-        many = jnp.asarray(jnp.inf, tree.largest(b).dtype)
-        start = (tree.scale(-1, b), many, many, many, jnp.asarray(0), jnp.asarray(0))
-        x, change, last, *_ = lax.while_loop(going, iterate, start)
-        # Never numbers as if nothing had happened. Parts may change alternately.
-        small = float(jnp.finfo(_lowest(b)).eps) ** (-1 / 2)
-        solved = (change <= 1 / 8) | (jnp.maximum(change, last) <= small)
-        return jtu.tree_map(lambda x: jnp.where(solved, x, jnp.nan), x)
-
-    return lax.custom_linear_solve(g, y, solve, transpose_solve=solve)
-
-
 def factorise(g, y: Slopes) -> Slopes:
-    """The same by a factorisation of the matrix."""
+    """Solve a linear system of a residual by a factorisation of the matrix."""
 
     def solve(g, b):
         operator = lx.FunctionLinearOperator(g, jax.eval_shape(lambda: b))

@@ -39,7 +39,8 @@ class Drift(AbstractMove):
 
     def apply(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
         (y, carry), split = stage, system.split(self.kind)
-        return (split.drift(system, span.t0, span.h, data, y), carry), None
+        y, result = split.attempt(system, span.t0, span.h, data, y)
+        return (y, carry), result
 
     def undo(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
         return self.apply(system, span, data, stage)

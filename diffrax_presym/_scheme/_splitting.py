@@ -10,7 +10,7 @@ from .._compositions import stages
 from .._numbers import State
 from .._system._bound import System
 from .._system._split import AbstractSplit
-from ._base import AbstractPresymplecticSolver, Scheme
+from ._base import AbstractPresymplecticSolver, refuse_constrained, Scheme
 from ._engine import inverse, Moves, Stages
 from ._moves import Drift, Enter, Kick
 from ._strong_friction import friction_limit
@@ -72,7 +72,14 @@ class AbstractSplitting(AbstractPresymplecticSolver):
             enter = Enter()
             moves = [enter, *moves, inverse(enter)]
             spans = [(0, 0, 0), *spans, (1, 1, 0)]
-        scheme = Scheme(Stages(moves, spans), most_friction=most, pattern=pattern)
+        scheme = Scheme(
+            Stages(moves, spans),
+            # Interpolated values would be off the manifold.
+            is_resolved=kind != "linear" and not system.term.is_constrained,
+            most_friction=most,
+            failure=split.failure,
+            pattern=pattern,
+        )
         if not first:
             return scheme
         return scheme._replace(
@@ -95,6 +102,7 @@ def find_split(
     split, name = system.split(kind), type(solver).__name__
     if split is not None:
         return split
+    refuse_constrained(solver, system)
     if kind == "shared":
         raise ValueError(
             f"`{name}` keeps its order only for a constant mass and at most one rate "
@@ -122,14 +130,15 @@ def find_split(
         raise ValueError(
             f"`{name}` needs a system split into a kinetic part and a potential, but "
             f"this `{system.name}` is not. If its energy is a sum of the two, give its "
-            "parts: `MechanicalSystem(kinetic, potential)`. With a `force=f`, and for "
-            "any other energy, there are no such parts: use `PresymplecticGauss()`."
+            "parts: `MechanicalSystem(kinetic, potential)`, which also takes a "
+            "`force=f`. Any other energy has no such parts: use `PresymplecticGauss()`."
         )
     raise ValueError(
         f"`{name}` keeps its order only for a quadratic kinetic energy, written as "
         "`QuadraticKinetic(mass)`, or a quadratic potential, written as "
         "`QuadraticPotential(stiffness)`; and for friction that depends neither on "
-        "positions nor on the speed. Otherwise use `BlanesMoan4()` or `BlanesMoan6()`."
+        "positions nor on the speed, without a `force=f` of the velocity. Otherwise "
+        "use `Strang()`, `BlanesMoan4()` or `BlanesMoan6()`."
     )
 
 
@@ -320,6 +329,10 @@ class TunedRKN6(AbstractSplitting):
     Source: this package, `benchmarks/tuning.py`. The coefficients satisfy the
     conditions of order 6, and reduce the remaining error for oscillators over a range
     of frequencies and, at the next order, for any force.
+
+    Its steps are long. Between them, interpolated by
+    [`diffrax_presym.FixedStepAdjoint`][], the error may be 10 to 100 times that at
+    their ends, which [`diffrax_presym.choose_step`][] takes into account.
     """
 
     tableau: ClassVar[SplittingTableau] = TUNED_RKN_6

@@ -13,7 +13,7 @@ from .. import _tree as tree
 from .._checks import as_positive
 from .._numbers import cast_to, State
 from .._system._bound import System
-from ._base import AbstractPresymplecticSolver, Scheme
+from ._base import AbstractPresymplecticSolver, refuse_constrained, Scheme
 from ._engine import AbstractMove, Outcome, Span, Stage, Stages
 
 
@@ -171,6 +171,7 @@ class PresymplecticTao(AbstractPresymplecticSolver):
         return 2
 
     def scheme(self, system: System) -> Scheme:
+        refuse_constrained(self, system)
         if self.coupling is not None and jnp.shape(self.coupling) != ():
             raise ValueError(
                 "`PresymplecticTao(coupling)` must be a scalar, but has shape "

@@ -1,5 +1,6 @@
 import abc
 from collections.abc import Callable
+from typing import ClassVar
 
 import diffrax as dfx
 import equinox as eqx
@@ -74,6 +75,25 @@ class AbstractSystem(dfx.AbstractTerm):
             x if dx is None else tree.sum(x, dx) for x, dx in zip(y, dy, strict=True)
         )
 
+    def check_state(self, y: PyTree) -> None:
+        """`ValueError` if `y` is not a state: by default, unless it is a pair `(q, p)`
+        of pytrees of one structure, shape and precision."""
+        check_state(y)
+
+    # Systems whose states lie on a manifold.
+
+    is_constrained: ClassVar[bool] = False
+
+    def violation(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar | None:
+        """By how much a state is off the manifold of the system, or its velocity off
+        the tangent space; `None`, the default, if there is no such manifold."""
+        return None
+
+    def project(self, t: Time, y: State, args: PyTree = None) -> State:
+        """The state moved to the manifold of the system, and its momentum to the
+        tangent space. By default, where there is none, `y`."""
+        return y
+
     def is_valid(
         self, t: Time, q: Q, p: P, args: PyTree = None
     ) -> Bool[Array, ""] | None:
@@ -89,7 +109,7 @@ class AbstractSystem(dfx.AbstractTerm):
     @property
     def mechanics(self) -> Mechanics:
         """What friction needs to know of the system; by default nothing is known."""
-        return Mechanics(has_mass=False)
+        return Mechanics(mass_varies=True)
 
     @property
     def drift_is_autonomous(self) -> bool:
@@ -100,7 +120,7 @@ class AbstractSystem(dfx.AbstractTerm):
     # The full vector field, for Diffrax.
 
     def vf(self, t, y: State, args: PyTree) -> State:
-        check_state(y)
+        self.check_state(y)
         t = as_time(t)
         velocity, force = self.velocity_and_force(t, *y, args)
         friction = self.fit_friction(y[1])

@@ -9,10 +9,12 @@ import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, PyTree
 
 from .. import _tree as tree
+from .._friction._base import Parts
 from .._friction._linear import LinearFriction
 from .._numbers import as_time, cast_to, State, Time
 from .._results import NONFINITE
 from ._base import AbstractSystem
+from ._split import AbstractSplit
 
 
 _T = TypeVar("_T")
@@ -30,10 +32,13 @@ class System(eqx.Module):
     term: Any  # an `AbstractSystem`
     args: PyTree
     direction: int | Array
-    friction: LinearFriction | None
+    parts: Parts  # of its friction
+    splits: tuple[AbstractSplit, ...]
+    friction: LinearFriction | None  # linear, that depends on time alone
 
     def __init__(self, term: AbstractSystem, args: PyTree, direction, y: State):
         self.term, self.args, self.direction = term, args, direction
+        self.parts, self.splits = term.parts, term.splits
         self.friction = term.fit_friction(tree.values(y)[1])
 
     def time(self, t: ArrayLike) -> Array:
@@ -110,8 +115,7 @@ class System(eqx.Module):
 
     def split(self, kind: str) -> Any:
         """The first split of a kind, see `_split.py`; `None` if there is none."""
-        splits = (split for split in self.term.splits if kind in split.kinds)
-        return next(splits, None)
+        return next((split for split in self.splits if kind in split.kinds), None)
 
     @property
     def prepares_once(self) -> bool:

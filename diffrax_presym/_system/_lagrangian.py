@@ -3,27 +3,17 @@
 from collections.abc import Callable
 
 import jax
-import jax.lax as lax
 import jax.numpy as jnp
-import jax.scipy.linalg as jsl
-from jaxtyping import Array, Bool, Inexact, PyTree
+from jaxtyping import Array, Bool, PyTree
 
 from .. import _tree as tree
 from .._checks import check_callable, describe, scalar_fn
-from .._forms import matvec
+from .._forms import Matrix, solve_positive, Vector
 from .._friction._base import AbstractFriction, Mechanics
 from .._friction._damping import as_laws
 from .._numbers import cast_to, Scalar, Time
 from ._base import AbstractSystem
 from ._split import AbstractSplit
-
-
-_Vector = Inexact[Array, " n"]
-_Matrix = Inexact[Array, "n n"]
-
-# The fastest factorisation depends on the size: written out in full, which for more
-# entries takes long to compile; a loop; and LAPACK, which takes long to call.
-_SMALL, _LARGE = 4, 16
 
 
 class LagrangianSystem(AbstractSystem):
@@ -118,7 +108,7 @@ class LagrangianSystem(AbstractSystem):
     def splits(self) -> tuple[AbstractSplit, ...]:
         return ()
 
-    def mass_matrix(self, t: Time, q: _Vector, args: PyTree = None) -> _Matrix:
+    def mass_matrix(self, t: Time, q: Vector, args: PyTree = None) -> Matrix:
         """The mass matrix, in the precision of `q`."""
         if not hasattr(q, "shape") or jnp.ndim(q) != 1:
             raise ValueError(
@@ -135,8 +125,8 @@ class LagrangianSystem(AbstractSystem):
         return cast_to(M, q)
 
     def from_velocity(
-        self, t: Time, y: tuple[_Vector, _Vector], args: PyTree = None
-    ) -> tuple[_Vector, _Vector]:
+        self, t: Time, y: tuple[Vector, Vector], args: PyTree = None
+    ) -> tuple[Vector, Vector]:
         """The state `(q, p)`, with $p = M(t, q) v$, of positions and velocities.
 
         **Arguments:**
@@ -151,19 +141,19 @@ class LagrangianSystem(AbstractSystem):
         q, v = y
         return q, self.mass_matrix(t, q, args) @ v
 
-    def energy(self, t: Time, q: _Vector, p: _Vector, args: PyTree = None) -> Scalar:
+    def energy(self, t: Time, q: Vector, p: Vector, args: PyTree = None) -> Scalar:
         v = self.velocity(t, q, p, args)
         return p @ v / 2 + self._potential(t, q, args)
 
-    def velocity(self, t: Time, q: _Vector, p: _Vector, args: PyTree = None) -> _Vector:
-        return _solve_positive(self.mass_matrix(t, q, args), p)
+    def velocity(self, t: Time, q: Vector, p: Vector, args: PyTree = None) -> Vector:
+        return solve_positive(self.mass_matrix(t, q, args), p)
 
-    def force(self, t: Time, q: _Vector, p: _Vector, args: PyTree = None) -> _Vector:
+    def force(self, t: Time, q: Vector, p: Vector, args: PyTree = None) -> Vector:
         return self.velocity_and_force(t, q, p, args)[1]
 
     def velocity_and_force(
-        self, t: Time, q: _Vector, p: _Vector, args: PyTree = None
-    ) -> tuple[_Vector, _Vector]:
+        self, t: Time, q: Vector, p: Vector, args: PyTree = None
+    ) -> tuple[Vector, Vector]:
         v = self.velocity(t, q, p, args)
 
         def lagrangian(q):
@@ -177,60 +167,9 @@ class LagrangianSystem(AbstractSystem):
         return cast_to(scalar_fn(self.potential, "The potential")(t, q, args), q)
 
     def is_valid(
-        self, t: Time, q: _Vector, p: _Vector, args: PyTree = None
+        self, t: Time, q: Vector, p: Vector, args: PyTree = None
     ) -> Bool[Array, ""]:
         M = self.mass_matrix(t, q, args)
         rounding = 1e3 * float(jnp.finfo(M.dtype).eps) * jnp.max(jnp.abs(M), initial=0)
         symmetric = jnp.all(jnp.abs(M - M.T) <= rounding)
-        return symmetric & tree.all_finite((q, _solve_positive(M, p)))
-
-
-@jax.jit  # Outside of a solve, a loop would be compiled again by each call.
-def _solve_positive(M: _Matrix, p: _Vector) -> _Vector:
-    """The solution of `M v = p`, NaN if `M` is not positive definite."""
-    # The derivative is that of the solution, not of the steps to it.
-    return lax.custom_linear_solve(
-        lambda v: matvec(M, v), p, lambda _, p: _by_size(M, p), symmetric=True
-    )
-
-
-def _by_size(M: _Matrix, p: _Vector) -> _Vector:
-    """The same without derivatives, by the fastest factorisation of this size."""
-    n = len(p)
-    if n > _LARGE:
-        L = jnp.linalg.cholesky(M, symmetrize_input=False)
-        return jsl.cho_solve((L, True), p)
-    if n > _SMALL:
-        return _eliminate(M, p)
-    # Cholesky's factorisation, scalar by scalar.
-    L = [[M[i, j] for j in range(i + 1)] for i in range(n)]
-    v = [p[i] for i in range(n)]
-    inverse = []
-    for j in range(n):
-        for i in range(j, n):
-            for k in range(j):
-                L[i][j] = L[i][j] - L[i][k] * L[j][k]
-        inverse.append(1 / jnp.sqrt(L[j][j]))
-        for i in range(j + 1, n):
-            L[i][j] = L[i][j] * inverse[j]
-    for i in range(n):
-        for k in range(i):
-            v[i] = v[i] - L[i][k] * v[k]
-        v[i] = v[i] * inverse[i]
-    for i in reversed(range(n)):
-        for k in range(i + 1, n):
-            v[i] = v[i] - L[k][i] * v[k]
-        v[i] = v[i] * inverse[i]
-    return jnp.stack(v)
-
-
-def _eliminate(M: _Matrix, p: _Vector) -> _Vector:
-    """By Gauss--Jordan elimination, which needs no pivots if `M` is definite."""
-    rows = jnp.arange(len(p))[:, None]
-
-    def eliminate(k, A):
-        row = A[k] / jnp.where(A[k, k] > 0, A[k, k], jnp.nan)
-        return jnp.where(rows == k, row[None], A - jnp.outer(A[:, k], row))
-
-    A = jnp.concatenate([M, p[:, None]], axis=1)
-    return lax.fori_loop(0, len(p), eliminate, A)[:, -1]
+        return symmetric & tree.all_finite((q, solve_positive(M, p)))

@@ -57,7 +57,7 @@ def DissipativeHamiltonian(kinetic, potential, eta1, eta2) -> MechanicalSystem:
 
 
 def _as_damping(law, name: str) -> Damping:
-    mechanics = Mechanics(has_mass=False)
+    mechanics = Mechanics()
     parts = sum((x.parts(mechanics) for x in as_laws(law, name)), Parts())
     damping = one_rate(parts)
     return ConstantDamping(0.0) if damping is None else damping
@@ -94,7 +94,7 @@ class _ScaledKinetic(AbstractKinetic):
         return tree.scale(scale, kinetic.velocity(t, p, args))
 
     def _by_eta1(self, p: PyTree) -> LinearFriction:
-        mechanics = Mechanics(has_mass=False)
+        mechanics = Mechanics()
         friction = fit_friction(self.eta1.parts(mechanics).linear, mechanics, p)
         assert friction is not None
         return friction
