@@ -50,7 +50,8 @@ def states(
     **options,
 ) -> Any:
     """What is saved in `x` equal steps, or in adaptive ones with tolerance `x`: by
-    default the final state; and how many steps it took, if they `count`.
+    default the final state; if they `count`, also how many steps it took, and whether
+    values between these are interpolated.
 
     Solvers of this package run in the loop of `FixedStepAdjoint`. With a step density
     the steps vary, and the first is one of `x` equal ones. The result is not a number
@@ -65,13 +66,15 @@ def states(
         epsilon, dt0 = dt0 / density(t0, y0, args), None
         options["controller"] = dps.StepDensityController(epsilon, density)
         options["max_steps"] = MOST
-    elif isinstance(solver, dps.extend.AbstractPresymplecticSolver):
+    if isinstance(solver, dps.extend.AbstractPresymplecticSolver) and not adaptive:
         options.setdefault("adjoint", dps.FixedStepAdjoint())
     sol = solve(term, solver, t0, t1, dt0, y0, args, **options)
     good = sol.result == dfx.RESULTS.successful
     ys = sol.ys if "saveat" in options else last(sol)
     ys = jax.tree.map(lambda y: jnp.where(good, y, jnp.nan), ys)
-    return (ys, sol.stats["num_steps"]) if count else ys
+    if not count:
+        return ys
+    return ys, sol.stats["num_steps"], sol.stats.get("interpolated", False)
 
 
 def relative_error(y, exact):

@@ -71,7 +71,8 @@ GROUPS = ("ours", "Diffrax", "heyoka")
 def solver_of(problem, solver, terms=None, ts=None, **options):
     """`solve(x)`, with `x` the number of steps, or the tolerance.
 
-    It returns the final state, or those at all of `ts`, and the number of steps.
+    It returns the final state, or those at all of `ts`, the number of steps, and
+    whether values between these are interpolated.
     """
     if ts is not None:
         options["saveat"] = dfx.SaveAt(ts=jnp.asarray(ts))
@@ -91,18 +92,15 @@ def semi_implicit_euler(problem, ts=None):
     end = jnp.asarray(problem.t1 if ts is None else ts)
 
     def run(x):
-        (q, P), steps = solve(x)
-        return (q, mechanical(end, P)), steps
+        (q, P), *counts = solve(x)
+        return (q, mechanical(end, P)), *counts
 
     return jax.jit(run)
 
 
 def step_counts(problem, evaluations, quick, saved=False):
-    """Numbers of steps by factors of the square root of two, from 0.4 per stage.
-
-    Where all of the times are `saved`, steps end at these times, or a few times at all
-    of them, as those of `choose_step` do.
-    """
+    """Numbers of steps by factors of the square root of two, from 0.4 per stage; where
+    all of the times are `saved`, also those whose ends are at saved times."""
     most = 4e3 if np.size(problem.q0) >= 1000 else 2e4 if quick else 1e5
     least = problem.t1 / (0.8 * evaluations * problem.unit)
     count = max(1, math.ceil(2 * math.log2(most / evaluations / least)))
@@ -111,8 +109,8 @@ def step_counts(problem, evaluations, quick, saved=False):
         spans = SAVED - 1
         divisors = [n for n in range(1, spans + 1) if spans % n == 0]
         longer = lambda n: next((k for k in divisors if k >= n), None)
-        counts = [longer(n) or spans * math.ceil(n / spans) for n in counts]
-        counts = list(dict.fromkeys(counts))
+        ends = [longer(n) or spans * math.ceil(n / spans) for n in counts]
+        counts = sorted({*counts, *ends})
     return [jnp.asarray(n) for n in counts]
 
 
@@ -154,10 +152,10 @@ def all_runs(problem, quick, ts=None):
 
 
 def evaluations(t1, ts, key, found):
-    """Of the force in a solve. Each saved time within a step costs as much as a step,
-    except with Gauss collocation and the solvers of Diffrax; with the multistep method
-    as much as a step of its start."""
-    (group, name), steps = key, found[1]
+    """Of the force in a solve. Where saved times are not interpolated, each of them
+    within a step costs as much as a step; with the multistep method as much as a step
+    of its start."""
+    (group, name), (_, steps, interpolated) = key, found
     known = {"SemiImplicitEuler": 1, "heyoka": math.nan}
     known |= {x: scheme.evaluations for x, scheme in (SCHEMES | DIFFRAX).items()}
     known |= {x: scheme.evaluations for x, scheme in OTHERS.items()}
@@ -166,7 +164,7 @@ def evaluations(t1, ts, key, found):
     if "Multistep" in name:
         between = known["BlanesCasasRKN8"]
         start = between * min(steps, SCHEMES[name].order - 1)
-    if ts is None or group != "ours" or "Gauss" in name:
+    if ts is None or group != "ours" or interpolated:
         return start + cost * steps
     at = ts / t1 * steps
     inside = np.sum(np.abs(at - np.round(at)) > 1e-6)

@@ -21,7 +21,7 @@ def _entry(name: str, message: str) -> Any:
     return results._name_to_item[name]
 
 
-_SUCCESSFUL: Any = dfx.RESULTS.successful
+SUCCESSFUL: Any = dfx.RESULTS.successful
 NONFINITE: Any = dfx.RESULTS.nonfinite  # pyright: ignore[reportAttributeAccessIssue]
 
 FRICTION_TOO_STRONG = _entry(

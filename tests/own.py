@@ -15,7 +15,7 @@ class CubicDrag(extend.AbstractFriction):
     c: float = 0.3
 
     def parts(self, mechanics):
-        if mechanics.mass_varies:
+        if mechanics.mass_varies or not mechanics.has_mass:
             raise ValueError("The mass is not known. Write the drag as `force=f`.")
         return extend.Parts(drags=(self,))
 

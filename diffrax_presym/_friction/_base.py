@@ -27,11 +27,13 @@ class Mechanics(NamedTuple):
     **Attributes:**
 
     - `mass`: as in [`diffrax_presym.QuadraticKinetic`][]; `None` is one.
+    - `has_mass`: whether the mass is known.
     - `mass_varies`: whether it depends on positions or momenta, as the mass of joints
         or of relativistic particles: no drift is exact.
     """
 
     mass: Any = None
+    has_mass: bool = True
     mass_varies: bool = False
 
 

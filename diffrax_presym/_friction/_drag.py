@@ -12,7 +12,7 @@ from .._forms import fit_form, is_operator
 from .._numbers import cast_to, Time
 from ._base import AbstractFriction, MASS, Mechanics, Parts
 from ._damping import as_numbers, Numbers
-from ._viscous import arrays
+from ._viscous import arrays, needs_mass
 
 
 _COEFFICIENT = "`Drag(coefficient)`"
@@ -69,6 +69,7 @@ class Drag(AbstractFriction):
         self.medium = medium
 
     def parts(self, mechanics: Mechanics) -> Parts:
+        needs_mass(mechanics, "Drag")
         if mechanics.mass_varies:
             raise ValueError(
                 "`Drag` acts on bodies of constant mass, `QuadraticKinetic(mass)`. "

@@ -29,6 +29,16 @@ _FORMS = (
 )
 
 
+def needs_mass(mechanics: Mechanics, name: str) -> None:
+    if not mechanics.has_mass:
+        raise ValueError(
+            f"`{name}` is friction per velocity, and needs to know the mass. Write "
+            "`MechanicalSystem(kinetic, potential, friction)`, give a system of your "
+            "own the property `mechanics`, or write the friction as a rate, "
+            "`ConstantDamping(rate)`."
+        )
+
+
 def arrays(form: PyTree, name: str) -> PyTree:
     """What a function returned, as arrays."""
     if form is None:
@@ -44,6 +54,7 @@ class ViscousFriction(AbstractFriction):
     def parts(self, mechanics: Mechanics) -> Parts:
         if mechanics.mass_varies:
             return Parts(forces=(self,))
+        needs_mass(mechanics, "ViscousDamping")
         return Parts((Linear(LinearScale(), self.coefficients, per_velocity=True),))
 
     def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
@@ -59,6 +70,8 @@ class LocalFriction(AbstractFriction):
     def parts(self, mechanics: Mechanics) -> Parts:
         if self.per_velocity and mechanics.mass_varies:
             return Parts(forces=(self,))
+        if self.per_velocity:
+            needs_mass(mechanics, "ViscousDamping")
         return Parts(local=(self,))
 
     def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:

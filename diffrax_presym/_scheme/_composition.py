@@ -19,8 +19,8 @@ class Composition(AbstractPresymplecticSolver):
     """Several steps of a scheme as one, given by weights.
 
     Order as given. The cost per step is that of the base times the number of weights.
-    Uses Hermite interpolation for dense/ts output, at the cost of up to seven
-    more steps.
+    Uses Hermite interpolation for dense/ts output, in Diffrax's own loop at the cost of
+    up to seven more steps.
 
     With equal weights, `Composition(base, (1 / n,) * n)`, it is `n` steps of the base,
     and what Diffrax's loop does once per step is done `n` times less often.
@@ -99,8 +99,8 @@ def SuzukiYoshida(
     r"""The triple jump of Suzuki and Yoshida, to any even order.
 
     Order as given; $3^{r/2 - 1}$ force evaluations per step at order $r$. Symmetric.
-    Uses Hermite interpolation for dense/ts output, at the cost of up to seven
-    more steps.
+    Uses Hermite interpolation for dense/ts output, in Diffrax's own loop at the cost of
+    up to seven more steps.
 
     The scheme of the paper. Its error constants are large, and its stages extend beyond
     both ends of the step, by up to 0.35, 0.65 and 0.92 of its length at orders 4, 6 and
@@ -150,7 +150,8 @@ def Suzuki4(base: AbstractPresymplecticSolver | None = None) -> Composition:
     """Suzuki's fourth-order composition of five stages.
 
     4th order, 5 stages, symmetric: with the default base 5 force evaluations per step.
-    Uses Hermite interpolation for dense/ts output, at the cost of another step.
+    Uses Hermite interpolation for dense/ts output, in Diffrax's own loop at the cost of
+    another step.
 
     Its error is several times smaller than that of the triple jump
     ([`diffrax_presym.SuzukiYoshida`][]) at equal cost, and its stages stay
@@ -178,8 +179,8 @@ def SofroniouSpaletta(
     """Sofroniou and Spaletta's compositions of 13, 21 and 35 stages.
 
     6th, 8th or 10th order, symmetric: with the default base 13, 21 or 35 force
-    evaluations per step. Uses Hermite interpolation for dense/ts output, at the cost of
-    three more steps.
+    evaluations per step. Uses Hermite interpolation for dense/ts output, in Diffrax's
+    own loop at the cost of three more steps.
 
     The recommended compositions of high order, for any base. If the kinetic part has a
     known flow, a [`diffrax_presym.Splitting`][] is more accurate at equal cost.

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 from .. import _tree as tree
 from .._numbers import State
-from .._results import _SUCCESSFUL, FRICTION_TOO_STRONG, NONFINITE, OFF_MANIFOLD
+from .._results import FRICTION_TOO_STRONG, NONFINITE, OFF_MANIFOLD, SUCCESSFUL
 from .._system._bound import System
 from ._engine import Span
 
@@ -54,14 +54,14 @@ def explain(
     result = dfx.RESULTS.where(result == NONFINITE, scheme.failure, result)
     off = system.term.violation(ends[0][0], *tree.values(ends[0][1][0]), system.args)
     if off is not None:
-        failure = _SUCCESSFUL
+        failure = SUCCESSFUL
         least = float(jnp.finfo(off.dtype).eps) ** 0.5
         for most, entry in OFF_MANIFOLD.items():
             failure = dfx.RESULTS.where(off > max(most, least), entry, failure)
         # Whatever else failed, failed for this reason.
-        result = dfx.RESULTS.where(failure == _SUCCESSFUL, result, failure)
+        result = dfx.RESULTS.where(failure == SUCCESSFUL, result, failure)
     if scheme.check is not None:
         for t, point in ends:
             failure = scheme.check(system, t, *point)
-            result = dfx.RESULTS.where(result == _SUCCESSFUL, failure, result)
+            result = dfx.RESULTS.where(result == SUCCESSFUL, failure, result)
     return result

@@ -7,8 +7,9 @@ import equinox as eqx
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, Scheme
 from ._engine import inverse, Stages
+from ._find_split import find_split
 from ._moves import FrozenDrift, Kick
-from ._splitting import find_split, first_force
+from ._splitting import first_force
 from ._strong_friction import part_of, Pattern
 
 

@@ -141,7 +141,7 @@ class PresymplecticGauss(AbstractPresymplecticSolver):
     Order 2 to 16, twice the number of stages, and symmetric. Implicit for every
     Hamiltonian: a step takes one evaluation of velocity and force for all stages at
     once, by `jax.vmap`, in each of 3 to 15 iterations. Uses Hermite interpolation for
-    dense/ts output, at the cost of up to seven more steps.
+    dense/ts output, in Diffrax's own loop at the cost of up to seven more steps.
 
     For energies that are neither separable nor split, and for mechanics with a mass
     matrix, [`diffrax_presym.LagrangianSystem`][]. Conformally symplectic to rounding:

@@ -20,7 +20,8 @@ from .._results import MULTISTEP_UNSTABLE, OTHER_HISTORY
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, Scheme
 from ._engine import AbstractMove, forward, Outcome, prepare, Span, Stage
-from ._splitting import BlanesCasasRKN8, find_split
+from ._find_split import find_split
+from ._splitting import BlanesCasasRKN8
 
 
 class MultistepTable(NamedTuple):

@@ -9,9 +9,9 @@ from jaxtyping import Array, PyTree
 from .._compositions import stages
 from .._numbers import State
 from .._system._bound import System
-from .._system._split import AbstractSplit
-from ._base import AbstractPresymplecticSolver, refuse_constrained, Scheme
+from ._base import AbstractPresymplecticSolver, Scheme
 from ._engine import inverse, Moves, Stages
+from ._find_split import find_split
 from ._moves import Drift, Enter, Kick
 from ._strong_friction import friction_limit
 from ._tableaus import (
@@ -95,59 +95,12 @@ def first_force(system: System, kind: str, t: Array, y: State) -> PyTree:
     return split.force(system, t, split.enter(system, t, y) if kind == "linear" else y)
 
 
-def find_split(
-    solver: AbstractPresymplecticSolver, kind: str, system: System
-) -> AbstractSplit:
-    """The split that a scheme uses; an error if the system has none of this kind."""
-    split, name = system.split(kind), type(solver).__name__
-    if split is not None:
-        return split
-    refuse_constrained(solver, system)
-    if kind == "shared":
-        raise ValueError(
-            f"`{name}` keeps its order only for a constant mass and at most one rate "
-            "of constant friction. Write `MechanicalSystem(QuadraticKinetic(mass), "
-            "potential, ConstantDamping(rate))`; otherwise use `TunedRKN6()`, "
-            "`BlanesMoan6()` or `PresymplecticGauss()`."
-        )
-    if kind == "linear":
-        raise ValueError(
-            f"`{name}` keeps its order only for a linear force and at most one rate of "
-            "constant friction. Write `MechanicalSystem(QuadraticKinetic(mass), "
-            "QuadraticPotential(stiffness), ConstantDamping(rate))`; otherwise use "
-            "`TunedRKN6()`, `BlanesMoan6()` or `PresymplecticGauss()`."
-        )
-    if kind == "separable":
-        explicit = "`Strang()` or `BlanesMoan4()`, which are explicit, or "
-        instead = "" if system.split("any") is None else explicit
-        raise ValueError(
-            f"This `{system.name}` is not separable, so `{name}` would be implicit. If "
-            "the energy is a sum T(t, p) + V(t, q), give its parts: "
-            "`MechanicalSystem(kinetic, potential)`. Otherwise use "
-            f"{instead}`PresymplecticGauss()`."
-        )
-    if system.split("any") is None:
-        raise ValueError(
-            f"`{name}` needs a system split into a kinetic part and a potential, but "
-            f"this `{system.name}` is not. If its energy is a sum of the two, give its "
-            "parts: `MechanicalSystem(kinetic, potential)`, which also takes a "
-            "`force=f`. Any other energy has no such parts: use `PresymplecticGauss()`."
-        )
-    raise ValueError(
-        f"`{name}` keeps its order only for a quadratic kinetic energy, written as "
-        "`QuadraticKinetic(mass)`, or a quadratic potential, written as "
-        "`QuadraticPotential(stiffness)`; and for friction that depends neither on "
-        "positions nor on the speed, without a `force=f` of the velocity. Otherwise "
-        "use `Strang()`, `BlanesMoan4()` or `BlanesMoan6()`."
-    )
-
-
 class Splitting(AbstractSplitting):
     """A splitting into exact drifts and kicks, given by a tableau.
 
     Order as stated by the tableau; one force evaluation per kick, and one less if the
-    step starts with a kick. Uses Hermite interpolation for dense/ts output, at the
-    cost of up to seven more steps.
+    step starts with a kick. Uses Hermite interpolation for dense/ts output, in
+    Diffrax's own loop at the cost of up to seven more steps.
 
     For systems whose kinetic part has a known flow, where it is far more accurate
     than a composition at equal cost.
@@ -199,8 +152,8 @@ class Strang(AbstractSplitting):
     r"""Strang's splitting: kick, drift, kick; the leapfrog with an exact drift.
 
     2nd order and symmetric. One force evaluation per step. Uses 3rd order Hermite
-    interpolation for dense/ts output, at the cost of two more unless the system is
-    separable.
+    interpolation for dense/ts output, in Diffrax's own loop at the cost of two more
+    unless the system is separable.
 
     For any system with a kinetic part of known flow, especially
     [`diffrax_presym.BregmanHamiltonian`][], for which it is explicit and
@@ -225,8 +178,8 @@ class Strang(AbstractSplitting):
 class BlanesMoan4(AbstractSplitting):
     """Blanes and Moan's fourth-order splitting S6, for any kinetic energy.
 
-    4th order and symmetric. Six force evaluations per step. Uses Hermite
-    interpolation for dense/ts output, at the cost of another step.
+    4th order and symmetric. Six force evaluations per step. Uses Hermite interpolation
+    for dense/ts output, in Diffrax's own loop at the cost of another step.
 
     For any system with a kinetic part of known flow, such as a relativistic one.
     If the kinetic energy or the potential is quadratic,
@@ -250,8 +203,8 @@ class BlanesMoan4(AbstractSplitting):
 class BlanesMoan6(AbstractSplitting):
     """Blanes and Moan's sixth-order splitting S10, for any kinetic energy.
 
-    6th order and symmetric. Ten force evaluations per step. Uses Hermite
-    interpolation for dense/ts output, at the cost of three more steps.
+    6th order and symmetric. Ten force evaluations per step. Uses Hermite interpolation
+    for dense/ts output, in Diffrax's own loop at the cost of three more steps.
 
     For any system with a kinetic part of known flow. If the kinetic energy or the
     potential is quadratic, [`diffrax_presym.TunedRKN6`][] is more efficient.
@@ -265,8 +218,8 @@ class BlanesMoan6(AbstractSplitting):
 class BlanesMoanRKN4(AbstractSplitting):
     """Blanes and Moan's fourth-order Runge--Kutta--Nyström splitting SRKN 6b.
 
-    4th order and symmetric. Six force evaluations per step. Uses Hermite
-    interpolation for dense/ts output, at the cost of another step.
+    4th order and symmetric. Six force evaluations per step. Uses Hermite interpolation
+    for dense/ts output, in Diffrax's own loop at the cost of another step.
 
     For quadratic kinetic energies or quadratic potentials, at low accuracy, where steps
     of [`diffrax_presym.TunedRKN6`][] are too long.
@@ -281,7 +234,8 @@ class BlanesMoanRKN6(AbstractSplitting):
     """Blanes and Moan's sixth-order Runge--Kutta--Nyström splitting SRKN 14a.
 
     6th order and symmetric. Fourteen force evaluations per step. Uses Hermite
-    interpolation for dense/ts output, at the cost of three more steps.
+    interpolation for dense/ts output, in Diffrax's own loop at the cost of three more
+    steps.
 
     For quadratic kinetic energies or quadratic potentials. For oscillations
     [`diffrax_presym.TunedRKN6`][] is more accurate.
@@ -296,7 +250,8 @@ class BlanesCasasRKN8(AbstractSplitting):
     """The eighth-order Runge--Kutta--Nyström splitting of Blanes, Casas et al.
 
     8th order and symmetric. Nineteen force evaluations per step. Uses Hermite
-    interpolation for dense/ts output, at the cost of three more steps.
+    interpolation for dense/ts output, in Diffrax's own loop at the cost of three more
+    steps.
 
     For quadratic kinetic energies or quadratic potentials: for errors of 1e-9 or
     smaller, of motions that are not oscillations about an equilibrium.
@@ -320,7 +275,8 @@ class TunedRKN6(AbstractSplitting):
     """A sixth-order Runge--Kutta--Nyström splitting, tuned for oscillations.
 
     6th order and symmetric. Fourteen force evaluations per step. Uses Hermite
-    interpolation for dense/ts output, at the cost of three more steps.
+    interpolation for dense/ts output, in Diffrax's own loop at the cost of three more
+    steps.
 
     For quadratic kinetic energies or quadratic potentials: the first choice, with
     [`diffrax_presym.choose_step`][]. For oscillations about equilibria its error is
@@ -342,8 +298,8 @@ class TunedLinear8(AbstractSplitting):
     r"""A splitting for linear forces, with steps of half a period or more.
 
     8th order and symmetric for linear forces and constant friction. Fourteen force
-    evaluations per step. Uses Hermite interpolation for dense/ts output, at the cost of
-    three more steps.
+    evaluations per step. Uses Hermite interpolation for dense/ts output, in Diffrax's
+    own loop at the cost of three more steps.
 
     For forces linear in the positions, by a matrix or a stencil, written as
     [`diffrax_presym.QuadraticPotential`][]: damped waves, networks of springs,

@@ -109,7 +109,7 @@ class AbstractSystem(dfx.AbstractTerm):
     @property
     def mechanics(self) -> Mechanics:
         """What friction needs to know of the system; by default nothing is known."""
-        return Mechanics(mass_varies=True)
+        return Mechanics(has_mass=False)
 
     @property
     def drift_is_autonomous(self) -> bool:

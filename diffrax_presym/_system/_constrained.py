@@ -17,7 +17,7 @@ from .._checks import check_callable, describe
 from .._compositions import lengths
 from .._friction._base import AbstractFriction, Mechanics
 from .._numbers import as_time, Scalar, State, Time
-from .._results import _SUCCESSFUL, CONSTRAINT_NOT_SOLVED, NOT_REVERSIBLE
+from .._results import CONSTRAINT_NOT_SOLVED, NOT_REVERSIBLE, SUCCESSFUL
 from ._base import AbstractSystem, P, Q
 from ._bound import System
 from ._kinetic import QuadraticKinetic
@@ -267,18 +267,18 @@ class ConstrainedSplit(AbstractSplit):
             (t, y, result), (h, data, back) = state, row
             start = tree.values(y[0])
             y, found = self._stage(system, t, h, data, y)
-            failure = dfx.RESULTS.where(found, _SUCCESSFUL, CONSTRAINT_NOT_SOLVED)
+            failure = dfx.RESULTS.where(found, SUCCESSFUL, CONSTRAINT_NOT_SOLVED)
             if system.term.check_inverse:
                 values = lax.stop_gradient(tree.values(y))
                 (end, _), found = self._stage(system, t + h, -h, back, values)
                 miss, unit = tree.largest(tree.sub(end, start)), tree.largest(end)
                 found &= miss <= float(jnp.finfo(unit.dtype).eps) ** (2 / 3) * unit
-                other = dfx.RESULTS.where(found, _SUCCESSFUL, NOT_REVERSIBLE)
-                failure = dfx.RESULTS.where(failure == _SUCCESSFUL, other, failure)
-            result = dfx.RESULTS.where(result == _SUCCESSFUL, failure, result)
+                other = dfx.RESULTS.where(found, SUCCESSFUL, NOT_REVERSIBLE)
+                failure = dfx.RESULTS.where(failure == SUCCESSFUL, other, failure)
+            result = dfx.RESULTS.where(result == SUCCESSFUL, failure, result)
             return (t + h, y, result), None
 
-        success = jtu.tree_map(jnp.asarray, _SUCCESSFUL)
+        success = jtu.tree_map(jnp.asarray, SUCCESSFUL)
         start, single = (t, y, success), len(data[0]) == 1
         return lax.scan(stage, start, data, unroll=single)[0][1:]
 
