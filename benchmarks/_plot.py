@@ -82,3 +82,27 @@ def error_against_time(results, groups, path, columns):
     ]
     fig.legend(handles, list(color), loc="outside right upper", fontsize=8)
     save(fig, path)
+
+
+def ratio_dots(ratios, targets, title, path):
+    """One line for each problem, and a dot for the ratio at each target; the last line
+    is that of geometric means."""
+    fig, ax = plt.subplots(figsize=(7.5, 0.3 * len(ratios) + 1.2), layout="constrained")
+    lines = np.arange(len(ratios))[::-1]
+    table = np.array([*ratios.values()], float)
+    ax.hlines(lines, table.min(axis=1), table.max(axis=1), color="0.8", lw=2, zorder=1)
+    for column, target in zip(table.T, targets, strict=True):
+        ax.scatter(column, lines, s=36, zorder=2, label=f"to an error of {target:.0e}")
+    ax.axvline(1, color="black", lw=1)
+    ax.axhline(0.5, color="0.8", lw=1)
+    ax.set_xscale("log")
+    ticks = [x for x in (0.2, 0.5, 1, 2, 5, 10, 20) if 0.7 < x / table.min()]
+    ticks = [x for x in ticks if x / table.max() < 1.4]
+    ax.set_xticks(ticks, map(str, ticks))
+    ax.minorticks_off()
+    ax.set_yticks(lines, ratios)
+    ax.set(title=title, xlabel="times faster than the fastest solver of Diffrax")
+    ax.spines[["top", "right", "left"]].set_visible(False)
+    ax.tick_params(axis="y", length=0)
+    fig.legend(loc="outside lower center", ncols=len(targets), fontsize=9)
+    save(fig, path)

@@ -5,7 +5,7 @@ interleaved in one process. A point is the median time and the error of the solu
 the final time: the largest entry, relative to that of the solution, since damping
 shrinks both, against `reference`. Tables give the time to reach an error, read off each
 method's curve, and the geometric mean over the problems of (best Diffrax solver) / (our
-best). The figure goes to `docs/img/`. heyoka is measured if it is installed.
+best). Figures go to `docs/img/`. heyoka is measured if it is installed.
 
 `--set tuning` and `--set test` measure the two halves of a larger set of problems,
 without solvers from outside of JAX, with the worst problem beside the mean: nothing in
@@ -31,7 +31,7 @@ import numpy as np
 import problems
 import problems_test
 import problems_tuning
-from _plot import error_against_time, FOLDER
+from _plot import error_against_time, FOLDER, ratio_dots
 from _report import command_line, means, Table
 from _schemes import DIFFRAX, Scheme, SCHEMES
 from _solve import relative_error, states
@@ -172,6 +172,7 @@ def evaluations(t1, ts, key, found):
 
 
 def tables(results):
+    """Print them, and return the ratios of times for each problem and their mean."""
     ratios, heyoka, work = [], [], []
     for target in TARGETS:
         label = f"to an error of {target:.0e}:<22"
@@ -191,6 +192,9 @@ def tables(results):
         ]
         work.append([over(*both) for both in costs])
     columns = [f"{target:.0e}:>7.2f" for target in TARGETS]
+    of_times = list(zip(*ratios, strict=True))
+    mean, _ = means(of_times)
+    dots = dict(zip(results, of_times, strict=True)) | {"geometric mean": mean}
     captions = (
         "Best Diffrax solver over our best",
         "The same of force evaluations",
@@ -205,6 +209,7 @@ def tables(results):
                 table.row(problem, *row)
             table.row("geometric mean", *mean)
             table.row("least", *least)
+    return dots
 
 
 def picture(results, path):
@@ -259,9 +264,15 @@ def main():
             name, curves, taken = pool.submit(*task).result()
         results[name] = curves
         print(f"{name}: measured in {taken:.0f} s", flush=True)
-    tables(results)
-    if options.set == "seven" and not (options.saved or options.only):
+    dots = tables(results)
+    if options.quick or options.only:
+        return
+    if options.set == "seven":
         picture(results, options.output / "work_precision.png")
+        return
+    title = "201 saved times" if options.saved else "the state at the final time"
+    path = options.output / f"speed_{options.set}{'_saved' * options.saved}.png"
+    ratio_dots(dots, TARGETS, f"Fourteen problems, {title}", path)
 
 
 if __name__ == "__main__":

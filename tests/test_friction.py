@@ -129,6 +129,7 @@ def test_interpolated_friction_in_a_solve(name):
     eta, _ = VARYING[name]
     y0 = jnp.array([1.0, 0.5]), jnp.array([0.0, 0.3])
 
+    @functools.partial(jax.jit, static_argnames="dtype")
     def end(scale, dtype=jnp.float64):
         law = lambda t: jnp.asarray(scale, t.dtype) * eta(t).astype(t.dtype)
         system = dps.MechanicalSystem(dps.QuadraticKinetic(), harmonic, law)
@@ -139,9 +140,10 @@ def test_interpolated_friction_in_a_solve(name):
             **{"adjoint": dps.FixedStepAdjoint()},  # pyright: ignore
         ).ys
 
+    rate = jax.jit(lambda t: jax.jvp(eta, (t,), (1.0,))[1])
+
     def vf(t, y, scale):
-        rate = jax.jvp(eta, (t,), (1.0,))[1]
-        return np.concatenate([y[2:], -y[:2] - scale * np.asarray(rate) * y[2:]])
+        return np.concatenate([y[2:], -y[:2] - scale * np.asarray(rate(t)) * y[2:]])
 
     for scale in (1.0, 0.5):
         exact = scipy.integrate.solve_ivp(

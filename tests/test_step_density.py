@@ -167,6 +167,7 @@ def test_gradients_in_the_loop_of_the_package(adjoint, density):
     theirs = partial(at_ends, adjoint=dfx.RecursiveCheckpointAdjoint())
     gradient = lambda fn: jax.grad(fn, argnums=(0, 1, 2))(*AT)
     assert_close(gradient(at_ends), gradient(theirs), 1e-6)
+    loss = jax.jit(loss)
     for i, x in enumerate(AT):
         for k in range(x.size):
             h = 1e-5 * jnp.zeros(x.size).at[k].set(1.0).reshape(x.shape)
@@ -229,7 +230,7 @@ def test_a_step_for_a_tolerance():
     step = dps.choose_step(run, 0.0, 9.0, rtol=1e-7, atol=1e-7)
     sol: Any = run(step.dt0)
     assert step.steps == sol.stats["num_steps"] and not step.on_grid
-    vf = lambda t, y: np.concatenate(DRAGGED.vf(t, (y[:2], y[2:]), 1.0))
+    vf = jax.jit(lambda t, y: jnp.concatenate(DRAGGED.vf(t, (y[:2], y[2:]), 1.0)))
     exact = scipy.integrate.solve_ivp(
         *(vf, (0, 9), np.concatenate(Y0), "DOP853", np.asarray(ts)),
         rtol=1e-12,
