@@ -16,6 +16,7 @@ from ._loop._steps import StepsBetween as StepsBetween
 from ._scheme._compensated import Compensated as Compensated
 from ._scheme._composition import (
     Composition as Composition,
+    PresymplecticYoshida4 as PresymplecticYoshida4,
     SofroniouSpaletta as SofroniouSpaletta,
     Suzuki4 as Suzuki4,
     SuzukiYoshida as SuzukiYoshida,

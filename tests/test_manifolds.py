@@ -189,7 +189,7 @@ def test_order(case, scheme):
 @pytest.mark.parametrize("case", CASES)
 def test_a_step_is_undone(case):
     system, solver, y0 = CASES[case][0], dps.BlanesMoan4(), start(case)
-    step = jax.jit(lambda *at: solver.step(system, *at, None, None, False)[0])
+    step = jax.jit(lambda s, t, y: solver.step(system, s, t, y, None, None, False)[0])
     y2 = step(0.1, 0.0, step(0.0, 0.1, y0))
     for x, y in zip(jax.tree.leaves(y0), jax.tree.leaves(y2), strict=True):
         np.testing.assert_allclose(y, x, atol=4e-15)

@@ -1,7 +1,9 @@
 """Every scheme converges to the exact solution with the claimed order."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import scipy.integrate
 import scipy.special
 from helpers import few, harmonic, reference, Scheme, SCHEMES, trajectory
@@ -88,3 +90,9 @@ def test_order_on_oscillators(scheme: Scheme, case):
     error = lambda n: oscillator_error(case, scheme, 10 / (4 * n))
     order = measured_order(error, 10 * OSCILLATORS[case][-1])
     assert abs(order - scheme.order) < 0.15
+
+
+def test_yoshida_by_its_name():
+    assert eqx.tree_equal(dps.PresymplecticYoshida4(), dps.SuzukiYoshida(4))
+    with pytest.raises(ValueError, match="symmetric"):
+        dps.PresymplecticYoshida4(dps.PresymplecticEuler())

@@ -193,11 +193,11 @@ def _steps(span: Span, carry: _Carry) -> tuple[Array, Array]:
 class SymmetricMultistep(AbstractPresymplecticSolver):
     r"""A symmetric multistep method: high order with one force evaluation per step.
 
-    8th or 10th order. One force evaluation per step. The first `order - 1` steps, as
-    many after a jump or a change of the length of the steps, and outputs between steps
-    are steps of [`diffrax_presym.BlanesCasasRKN8`][], of 19 evaluations; their order is
-    8, and their error far below that of the method. Dense/ts output in Diffrax's loop
-    takes three of them in each step: save at the ends of steps.
+    8th or 10th order. One force evaluation per step. The first `order - 1` steps, and
+    as many after a jump or a change of the length of the steps, are steps of
+    [`diffrax_presym.BlanesCasasRKN8`][], of 19 evaluations; their order is 8, and their
+    error far below that of the method. Dense/ts output in Diffrax's own loop takes
+    three of them in each step; that of [`diffrax_presym.FixedStepAdjoint`][] none.
 
     For a [`diffrax_presym.QuadraticKinetic`][], any potential and at most one constant
     rate of friction, with steps of one length, at errors of 1e-6 and less: where the
