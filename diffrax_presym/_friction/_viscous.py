@@ -107,7 +107,9 @@ def ViscousDamping(coefficients) -> ViscousFriction | LocalFriction:
     `[ConstantDamping(alpha), ViscousDamping(beta * K)]`.
 
     If $C$ depends on time or place, by a function, the friction is part of the kicks,
-    and exact there at fixed positions: as [`diffrax_presym.PositionDamping`][].
+    and exact there at fixed positions: as [`diffrax_presym.PositionDamping`][]. With
+    any other kinetic energy a kick solves an equation for the momentum, as for a
+    `force=f`: use [`diffrax_presym.BlanesMoan4`][] or [`diffrax_presym.BlanesMoan6`][].
 
     !!! example
 

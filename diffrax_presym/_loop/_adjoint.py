@@ -26,11 +26,13 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     r"""The loop for steps that are known beforehand or reversible, and exact gradients
     in it: the recommended way to solve, with or without gradients.
 
-    Between steps the solution is a Hermite interpolation of degree 11 from the ends of
-    four steps, which takes no step of the scheme. Where that cannot follow the motion,
-    it is a shorter step: of schemes up to order two, in spans of fewer than three
-    steps, where friction over a step is more than 0.5, and with variable steps. The
-    statistics say which,
+    Between steps the solution is a Hermite interpolation of degree 11 from four ends of
+    steps, which takes no step of the scheme. Where that cannot follow the motion, it is
+    a shorter step: of schemes up to order two, of [`diffrax_presym.TunedLinear8`][], of
+    systems with constraints or on manifolds, in spans of fewer than three steps, where
+    neighbouring steps of `diffrax.StepTo` differ by more than a factor of two, where
+    friction over a step is more than 0.5, and with
+    [`diffrax_presym.StepDensityController`][]. The statistics say which,
     `sol.stats["interpolated"]`. A solve whose final or saved states are not finite
     fails; of an explicit scheme it ends at the next saved time or end of a step that is
     used for one, as other steps are not checked. For a time of `SaveAt(ts=...)` that is

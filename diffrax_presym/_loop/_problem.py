@@ -1,4 +1,4 @@
-"""A solve with steps that are known beforehand, as functions of states alone."""
+"""A solve with steps known beforehand or reversible, as functions of states alone."""
 
 from collections.abc import Callable
 from functools import partial

@@ -52,7 +52,8 @@ class PresymplecticEuler(AbstractPresymplecticSolver):
     r"""Presymplectic Euler's method.
 
     1st order. One force evaluation per step. Uses 3rd order Hermite interpolation for
-    dense/ts output.
+    dense/ts output in Diffrax's own loop; in that of
+    [`diffrax_presym.FixedStepAdjoint`][] a saved time between steps is a shorter step.
 
     For separable systems, for which the method is explicit; for others it would be
     implicit. The cheapest scheme. Not symmetric: the two variants are adjoint to each
@@ -91,7 +92,8 @@ class PresymplecticLeapfrog(AbstractPresymplecticSolver):
     r"""The presymplectic leapfrog, also known as Störmer--Verlet.
 
     2nd order and symmetric. One force evaluation per step. Uses 3rd order Hermite
-    interpolation for dense/ts output.
+    interpolation for dense/ts output in Diffrax's own loop; in that of
+    [`diffrax_presym.FixedStepAdjoint`][] a saved time between steps is a shorter step.
 
     For separable systems, for which the method is explicit; for others it would be
     implicit. For large steps and low accuracy, such as in optimisation: no scheme of

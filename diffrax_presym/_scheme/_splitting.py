@@ -152,8 +152,9 @@ class Strang(AbstractSplitting):
     r"""Strang's splitting: kick, drift, kick; the leapfrog with an exact drift.
 
     2nd order and symmetric. One force evaluation per step. Uses 3rd order Hermite
-    interpolation for dense/ts output, in Diffrax's own loop at the cost of two more
-    unless the system is separable.
+    interpolation for dense/ts output in Diffrax's own loop, at the cost of two more
+    unless the system is separable; in that of [`diffrax_presym.FixedStepAdjoint`][] a
+    saved time between steps is a shorter step.
 
     For any system with a kinetic part of known flow, especially
     [`diffrax_presym.BregmanHamiltonian`][], for which it is explicit and
@@ -287,7 +288,7 @@ class TunedRKN6(AbstractSplitting):
     of frequencies and, at the next order, for any force.
 
     Its steps are long. Between them, interpolated by
-    [`diffrax_presym.FixedStepAdjoint`][], the error may be 10 to 100 times that at
+    [`diffrax_presym.FixedStepAdjoint`][], the error may be 10 to 350 times that at
     their ends, which [`diffrax_presym.choose_step`][] takes into account.
     """
 
@@ -310,8 +311,9 @@ class TunedLinear8(AbstractSplitting):
     2} x$, the motion of $x$ is again an oscillation, so that constant friction costs no
     accuracy up to rates of twice the highest frequency.
 
-    Any other system is refused. Interpolation over such long steps is inaccurate: to
-    save at many times, let steps end there, with `diffrax.StepTo`.
+    Any other system is refused. Interpolation over such long steps is inaccurate, so in
+    the loop of [`diffrax_presym.FixedStepAdjoint`][] a saved time between steps is a
+    shorter step of the scheme; use that loop.
 
     Source: this package, `benchmarks/tuning.py`.
     """

@@ -110,7 +110,8 @@ class PresymplecticTao(AbstractPresymplecticSolver):
 
     2nd order, symmetric, and conformally symplectic in the doubled phase space. Three
     evaluations of velocity and force per step. Uses 3rd order Hermite interpolation for
-    dense/ts output, in Diffrax's own loop at the cost of two more.
+    dense/ts output in Diffrax's own loop, at the cost of two more; in that of
+    [`diffrax_presym.FixedStepAdjoint`][] a saved time between steps is a shorter step.
 
     The phase space is doubled: the copy $(\bar q, \bar p)$ replaces the arguments that
     would make the scheme implicit, and a harmonic coupling of strength $\xi$ keeps it

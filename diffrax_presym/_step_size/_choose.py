@@ -49,8 +49,9 @@ class ChosenStep(NamedTuple):
         scheme = "" if claim is None else f", that of the scheme {claim}"
         note = (
             " The errors do not fall as those of a smooth motion, and may be larger "
-            "than expected. If the force or the friction has kinks or jumps at known "
-            "times, write `stepsize_controller=StepsBetween(times)`."
+            "than expected. If the force has kinks, or the friction jumps, at known "
+            "times, write `stepsize_controller=StepsBetween(times)`; where a force "
+            "jumps, end the solve and begin another."
         )
         return (
             f"dt0={self.dt0:.6g}, {self.steps} steps, expected error "

@@ -39,8 +39,9 @@ class MechanicalSystem(AbstractSystem):
     | a power of the speed | [`diffrax_presym.Drag`][] |
     | any other | `force` |
 
-    The first two are linear, and exact in the drift: no scheme loses its order by them,
-    and in one-step schemes phase volume contracts exactly. With the others use
+    The first two are linear, and exact in the drift of a
+    [`diffrax_presym.QuadraticKinetic`][]: no scheme loses its order by them, and in
+    one-step schemes phase volume contracts exactly. With the others use
     [`diffrax_presym.BlanesMoan4`][] or [`diffrax_presym.BlanesMoan6`][]. A kick by a
     `force` solves an equation for the momentum alone, to the order of the scheme and
     symmetric; if the force is too stiff for the step, the solve fails.
