@@ -123,6 +123,7 @@ def test_friction_over_one_step_is_interpolated(name, sign):
             np.testing.assert_allclose(got, exact * p, rtol=2e-14, atol=4e-15)
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("name", VARYING)
 def test_interpolated_friction_in_a_solve(name):
     """Also where it is not interpolated in all steps, or in no member of a batch."""

@@ -290,6 +290,7 @@ GRADIENTS = {
 }
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("gradient", GRADIENTS)
 def test_gradient(case, gradient):

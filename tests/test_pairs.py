@@ -376,7 +376,7 @@ def check_composition(scheme, wrapper):
 # Which are tried when.
 
 # The number of rows, and entries that they all have.
-SAMPLE = int(os.environ.get("ROWS", 6))
+SAMPLE = int(os.environ.get("ROWS", 4))
 ENTRIES = set(os.environ.get("ENTRIES", "").split("|")) - {""}
 
 

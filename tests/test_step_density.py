@@ -142,6 +142,7 @@ def test_the_loop_of_the_package_takes_the_steps_of_diffrax(solver, sign):
     assert_close(ours.ys, theirs.ys, {2: 1e-2, 4: 1e-3, 6: 1e-5}[order])
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize(
     "adjoint",
     [
