@@ -14,6 +14,7 @@ import pytest
 import scipy.integrate
 
 import diffrax_presym as dps
+from diffrax_presym._system import _multipliers
 
 
 diffeqsolve: Any = dfx.diffeqsolve
@@ -258,6 +259,21 @@ def test_the_diagonals_of_a_chain_are_its_matrix(n):
     # Without a matrix, by products.
     other, _ = grad(y0[1] + 0.1, lx.GMRES(1e-13, 1e-13))
     np.testing.assert_allclose(other, value, rtol=1e-11)
+
+
+def test_a_linear_system_that_is_not_solved_is_one_member_of_a_batch():
+    """NaN in derivatives too, where Lineax itself raises an error for all."""
+    solver = lx.GMRES(1e-12, 1e-12, max_steps=4, restart=2)
+    matrices = jnp.stack([jnp.eye(6), jnp.diag(jnp.arange(1.0, 7.0))])
+
+    def total(b, A):
+        return jnp.sum(_multipliers.solve(lambda x: A @ x, b, solver))
+
+    slopes = jax.vmap(jax.grad(total), in_axes=(None, 0))(
+        jnp.arange(1.0, 7.0), matrices
+    )
+    np.testing.assert_allclose(slopes[0], jnp.ones(6), rtol=1e-12)
+    assert np.all(np.isnan(slopes[1]))
 
 
 # Gradients.

@@ -24,7 +24,7 @@ def solve(
     """The solution of a linear system, by its matrix unless a solver is given; NaN if
     there is none, in derivatives too, where Lineax itself would end a batch."""
 
-    def solve(linear: LinearMap, b: Multipliers) -> Multipliers:
+    def attempt(linear: LinearMap, b: Multipliers) -> Multipliers:
         found = lx.linear_solve(
             _operator(linear, b, solver),
             b,
@@ -33,7 +33,7 @@ def solve(
         )
         return tree.invalid_if(found.result != lx.RESULTS.successful, found.value)
 
-    return lax.custom_linear_solve(linear, b, solve, solve)
+    return lax.custom_linear_solve(linear, b, attempt, attempt)
 
 
 def _operator(
