@@ -176,7 +176,9 @@ def divide(form, x: PyTree, name: str, state: str, symmetric=True) -> PyTree:
         return x
     if is_operator(form):
         _check_symmetric(symmetric, name)
-        return lx.linear_solve(form, x, throw=False).value
+        # Not differentiated by Lineax, whose errors would end all members of a batch.
+        by = lambda form: lambda _, x: lx.linear_solve(form, x, throw=False).value
+        return lax.custom_linear_solve(form.mv, x, by(form), by(form.T))
 
     def leaf(x, form):
         if not is_matrix(form, x):

@@ -445,3 +445,14 @@ def test_drag_needs_bodies():
     wrong = dps.MechanicalSystem(unequal, harmonic, dps.Drag(0.1))
     with pytest.raises(ValueError, match="one for each body"):
         step(wrong, dps.BlanesMoan4(), 0.0, 0.1, Y0)
+
+
+def test_a_momentum_that_is_not_finite_is_one_member_of_a_batch():
+    """With a mass of Lineax too, which itself raises an error for all."""
+    mass = lx.MatrixLinearOperator(jnp.array([[2.0, 0.5], [0.5, 1.0]]))
+    energy = lambda p: jnp.sum(dps.QuadraticKinetic(mass).velocity(0.0, p) ** 2)
+    p = jnp.array([[1.0, 2.0], [jnp.nan, 1.0]])
+    slopes = jax.vmap(jax.grad(energy))(p)
+    inverse = np.linalg.inv(mass.matrix)
+    np.testing.assert_allclose(slopes[0], 2 * inverse @ inverse @ p[0], rtol=1e-14)
+    assert np.all(np.isnan(slopes[1]))
