@@ -190,7 +190,7 @@ def divide(form, x: PyTree, name: str, state: str, symmetric=True) -> PyTree:
 
 # The fastest factorisation depends on the size: written out in full, which for more
 # entries takes long to compile; a loop; and LAPACK, which takes long to call.
-_SMALL, _LARGE = 4, 16
+WRITTEN_OUT, _LARGE = 4, 16
 
 
 @jax.jit  # Outside of a solve, a loop would be compiled again by each call.
@@ -208,7 +208,7 @@ def _by_size(M: Matrix, p: Vector) -> Vector:
     if n > _LARGE:
         L = jnp.linalg.cholesky(M, symmetrize_input=False)
         return jsl.cho_solve((L, True), p)
-    if n > _SMALL:
+    if n > WRITTEN_OUT:
         return _eliminate(M, p)
     # Cholesky's factorisation, scalar by scalar.
     L = [[M[i, j] for j in range(i + 1)] for i in range(n)]

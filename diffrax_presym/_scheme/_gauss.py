@@ -140,7 +140,7 @@ class PresymplecticGauss(AbstractPresymplecticSolver):
 
     Order 2 to 16, twice the number of stages, and symmetric. Implicit for every
     Hamiltonian: a step takes one evaluation of velocity and force for all stages at
-    once, by `jax.vmap`, in each of 3 to 15 iterations. Uses Hermite interpolation for
+    once, by `jax.vmap`, in each of 3 to 20 iterations. Uses Hermite interpolation for
     dense/ts output, in Diffrax's own loop at the cost of up to seven more steps.
 
     For energies that are neither separable nor split, and for mechanics with a mass
@@ -225,7 +225,7 @@ class PresymplecticGauss(AbstractPresymplecticSolver):
             iteration may end, a Python float. Symmetry and structure are then kept to
             this tolerance only, and so are steps that `FixedStepAdjoint` takes
             backwards, whose `tol` must be larger. A hundredth of the error that is
-            wanted saves up to half of the iterations. Defaults to 0, for iteration to
+            wanted saves up to two thirds of the iterations. Defaults to 0, for iteration to
             rounding.
 
         **Raises:**

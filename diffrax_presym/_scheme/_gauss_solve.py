@@ -49,7 +49,10 @@ class GaussStep(eqx.Module):
     base: State  # the state at the start, in the frame of the middle
     base_lost: State
     h: Array
-    slopes: Callable[[Stages], Slopes]
+    # Of positions and momenta, in this frame, the last also of velocities.
+    slopes: Callable[..., Slopes]
+    velocities: Callable[..., PyTree]
+    forces: Callable[..., PyTree]
 
     def __init__(
         self,
@@ -67,31 +70,62 @@ class GaussStep(eqx.Module):
         if frames is not None and system.friction is not None:
             rest = system.friction.scaled(1 - frames.share)
 
-        def one(t, weight, both, q, p):
-            outwards, inwards = both
-            p = system.move_frame(outwards, p)
-            velocity, force = system.velocity_and_force(t, (q, p))
+        def net(t, weight, both, p, force):
             if rest is not None:
                 force = rest.net_force(t, force, p)
-            return tree.scale(weight, (velocity, system.move_frame(inwards, force)))
+            return tree.scale(weight, system.move_frame(both[1], force))
 
-        def slopes(stages: Stages) -> Slopes:
-            times = t0 + cast_to(table.nodes, h) * h
-            return jax.vmap(one)(times, cast_to(table.weights, h) * h, both, *stages)
+        def slope(t, weight, both, q, p):
+            p = system.move_frame(both[0], p)
+            velocity, force = system.velocity_and_force(t, (q, p))
+            return tree.scale(weight, velocity), net(t, weight, both, p, force)
+
+        def velocity(t, weight, both, q, p):
+            p = system.move_frame(both[0], p)
+            return tree.scale(weight, system.velocity(t, (q, p)))
+
+        def force(t, weight, both, q, p, v):
+            p = system.move_frame(both[0], p)
+            v = tree.scale(1 / jnp.where(weight == 0, 1, weight), v)
+            return net(t, weight, both, p, system.force_at(t, (q, p), v))
+
+        times, weights = t0 + cast_to(table.nodes, h) * h, cast_to(table.weights, h) * h
 
         # Traced once, with all that it depends on, to be differentiated.
-        many = lambda x: jnp.broadcast_to(x, (number, *x.shape))
-        self.slopes = eqx.filter_closure_convert(slopes, jtu.tree_map(many, base))
+        def convert(one, *state):
+            many = lambda x: jnp.broadcast_to(x, (number, *x.shape))
+            of_all = lambda *state: jax.vmap(one)(times, weights, both, *state)
+            return eqx.filter_closure_convert(of_all, *jtu.tree_map(many, state))
+
+        self.slopes, self.velocities = convert(slope, *base), convert(velocity, *base)
+        self.forces = convert(force, *base, base[0])
 
     def stages(self, slopes: Slopes) -> Stages:
-        # Add the small terms first.
+        q, p = slopes
+        return self._stages(0, q), self._stages(1, p)
+
+    def _stages(self, i: int, slopes: PyTree) -> PyTree:
         mu = gauss_table(self.number).mu
-        gained = jtu.tree_map(lambda x: matrix_product(mu, x), slopes)
-        add = lambda y, lost, x: y[None] + (lost[None] + x)
-        return jtu.tree_map(add, self.base, self.base_lost, gained)
+
+        def leaf(y, lost, x):
+            # Before and after the product, or XLA computes an entry again for each use.
+            x = matrix_product(mu, lax.optimization_barrier(x))
+            # Add the small terms first.
+            return lax.optimization_barrier(y[None] + (lost[None] + x))
+
+        return jtu.tree_map(leaf, self.base[i], self.base_lost[i], slopes)
+
+    def iterate(self, slopes: Slopes, stages: Stages) -> tuple[Slopes, Stages]:
+        """Better slopes and stages: momenta by the forces, then positions by the
+        velocities at these, which halves the iterations."""
+        q, p = stages
+        forces = self.forces(q, p, slopes[0])
+        p = self._stages(1, forces)
+        velocities = self.velocities(q, p)
+        return (velocities, forces), (self._stages(0, velocities), p)
 
     def residual(self, slopes: Slopes) -> Slopes:
-        return tree.sub(self.slopes(self.stages(slopes)), slopes)
+        return tree.sub(self.slopes(*self.stages(slopes)), slopes)
 
 
 def matrix_product(matrix, x):
@@ -148,8 +182,7 @@ def fixed_point(max_iterations: int, tolerance: float, step: GaussStep, guess: S
 
     def iterate(search: _Search) -> _Search:
         _, count, last, before, least, stalled, fresh, *both = search.record
-        slopes = step.slopes(search.stages)
-        stages = step.stages(slopes)
+        slopes, stages = step.iterate(search.slopes, search.stages)
         change = largest_change(stages, search.stages, dtype)
         moved = [
             (tree.largest(tree.sub(x, y)) / (eps * tree.largest(x))).astype(dtype)
@@ -171,12 +204,13 @@ def fixed_point(max_iterations: int, tolerance: float, step: GaussStep, guess: S
         status = jnp.where(converged, _CONVERGED, failed)
         least = jnp.minimum(change, least)
         start = lambda x, y: jtu.tree_map(lambda x, y: jnp.where(restart, x, y), x, y)
-        record = start(
+        entries = start(
             [_GOING, count + 1, 0, 0, jnp.inf, 0, 1, jnp.inf, jnp.inf],
             [status, count + 1, change, last, least, stalled, fresh, *moved],
         )
-        record = jnp.stack([number(x) for x in record])
-        return _Search(start(step.stages(nothing), stages), slopes, record)
+        record = jnp.stack([number(x) for x in entries])
+        stages, slopes = start((step.stages(nothing), nothing), (stages, slopes))
+        return _Search(stages, slopes, record)
 
     def going(search: _Search):
         record = search.record

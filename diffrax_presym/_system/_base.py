@@ -66,7 +66,13 @@ class AbstractSystem(dfx.AbstractTerm):
         self, t: Time, q: Q, p: P, args: PyTree = None
     ) -> tuple[Q, P]:
         """Both at once, where they share computations."""
-        return self.velocity(t, q, p, args), self.force(t, q, p, args)
+        v = self.velocity(t, q, p, args)
+        return v, self.force_at(t, q, p, v, args)
+
+    def force_at(self, t: Time, q: Q, p: P, v: Q, args: PyTree = None) -> P:
+        """The force at a known velocity, which spares a system of which forces depend
+        on it the way there. An iteration passes that of its last round."""
+        return self.force(t, q, p, args)
 
     def add(self, y: State, dy: tuple[Q | None, P | None]) -> State:
         """The state `y` displaced by `dy`, of which either part may be `None`: a sum,

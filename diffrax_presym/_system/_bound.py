@@ -71,6 +71,10 @@ class System(eqx.Module):
         """The force on `p`, without linear friction."""
         return self.term.force(t, *tree.values(y), self.args)
 
+    def force_at(self, t: Time, y: State, v: PyTree) -> PyTree:
+        """The same, at a known velocity."""
+        return self.term.force_at(t, *tree.values(y), v, self.args)
+
     def velocity_and_force(self, t: Time, y: State) -> State:
         """The vector field without linear friction."""
         return self.term.velocity_and_force(t, *tree.values(y), self.args)

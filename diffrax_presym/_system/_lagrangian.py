@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, PyTree
 
 from .. import _tree as tree
 from .._checks import check_callable, describe, scalar_fn
-from .._forms import Matrix, solve_positive, Vector
+from .._forms import Matrix, solve_positive, Vector, WRITTEN_OUT
 from .._friction._base import AbstractFriction, Mechanics
 from .._friction._damping import as_laws
 from .._numbers import cast_to, Scalar, Time
@@ -151,17 +151,19 @@ class LagrangianSystem(AbstractSystem):
     def force(self, t: Time, q: Vector, p: Vector, args: PyTree = None) -> Vector:
         return self.velocity_and_force(t, q, p, args)[1]
 
-    def velocity_and_force(
-        self, t: Time, q: Vector, p: Vector, args: PyTree = None
-    ) -> tuple[Vector, Vector]:
-        v = self.velocity(t, q, p, args)
+    def force_at(
+        self, t: Time, q: Vector, p: Vector, v: Vector, args: PyTree = None
+    ) -> Vector:
+        if len(q) <= WRITTEN_OUT:
+            # The compiler shares what this has in common with another velocity here.
+            v = self.velocity(t, q, p, args)
 
         def lagrangian(q):
             kinetic = v @ (self.mass_matrix(t, q, args) @ v) / 2
             return kinetic - self._potential(t, q, args)
 
         force = jax.grad(lagrangian)(q)
-        return v, self.add_forces(force, self.external, t, q, p, v, args)
+        return self.add_forces(force, self.external, t, q, p, v, args)
 
     def _potential(self, t, q, args):
         return cast_to(scalar_fn(self.potential, "The potential")(t, q, args), q)
