@@ -12,6 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Inexact, PyTree
 
 from ._checks import as_finite, as_parameter, as_positive
+from ._implicit import solve_linear
 from ._numbers import cast_to
 
 
@@ -176,9 +177,7 @@ def divide(form, x: PyTree, name: str, state: str, symmetric=True) -> PyTree:
         return x
     if is_operator(form):
         _check_symmetric(symmetric, name)
-        # Not differentiated by Lineax, whose errors would end all members of a batch.
-        by = lambda form: lambda _, x: lx.linear_solve(form, x, throw=False).value
-        return lax.custom_linear_solve(form.mv, x, by(form), by(form.T))
+        return solve_linear(form.mv, x, lx.AutoLinearSolver(True), lambda _: form)
 
     def leaf(x, form):
         if not is_matrix(form, x):

@@ -1,5 +1,6 @@
 """Equations that are solved by iteration, and their derivatives."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -7,6 +8,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import lineax as lx
 from jaxtyping import Array, Inexact, PyTree
 
 from . import _tree as tree
@@ -49,6 +51,27 @@ def largest_change(x: PyTree, y: PyTree, dtype) -> Inexact[Array, ""]:
         return (change / jnp.maximum(size, float(info.tiny))).astype(dtype)
 
     return jtu.tree_reduce(jnp.maximum, jtu.tree_map(leaf, x, y), jnp.zeros((), dtype))
+
+
+def solve_linear(
+    linear: Callable[[PyTree], PyTree],
+    b: PyTree,
+    solver: lx.AbstractLinearSolver,
+    operator: Callable[..., lx.AbstractLinearOperator] | None = None,
+) -> PyTree:
+    """The solution of a linear system by Lineax, which is given as `operator(linear)`
+    if it has a structure; NaN if there is none, in derivatives too, where Lineax itself
+    would end all members of a batch."""
+
+    def attempt(linear, b):
+        if operator is None:
+            known = lx.FunctionLinearOperator(linear, jax.eval_shape(lambda: b))
+        else:
+            known = operator(linear)
+        found = lx.linear_solve(known, b, solver, throw=False)
+        return tree.invalid_if(found.result != lx.RESULTS.successful, found.value)
+
+    return lax.custom_linear_solve(linear, b, attempt, attempt)
 
 
 def contract(g, y: PyTree) -> PyTree:

@@ -7,12 +7,13 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Inexact, PyTree
 
 from .. import _tree as tree
 from .._checks import check_root_finder
-from .._implicit import contract, implicit
+from .._implicit import contract, implicit, solve_linear
 from .._numbers import cast_to, State
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, refuse_constrained, Scheme
@@ -20,7 +21,6 @@ from ._collocation import gauss_table, legendre, MAX_STAGES
 from ._engine import AbstractMove, Outcome, Span, Stage
 from ._gauss_solve import (
     by_root_finder,
-    factorise,
     fixed_point,
     Frames,
     GaussStep,
@@ -119,8 +119,9 @@ class Collocation(AbstractMove):
             limits = self.max_iterations, self.tolerance
             find, tangent = eqx.Partial(fixed_point, *limits), contract
         else:
-            how = self.root_finder, self.max_iterations
-            find, tangent = eqx.Partial(by_root_finder, *how), factorise
+            find = eqx.Partial(by_root_finder, self.root_finder, self.max_iterations)
+            how = lx.AutoLinearSolver(well_posed=True)
+            tangent = eqx.Partial(solve_linear, solver=how)
         return implicit(step, guess, find=find, tangent=tangent)
 
 
@@ -225,8 +226,8 @@ class PresymplecticGauss(AbstractPresymplecticSolver):
             iteration may end, a Python float. Symmetry and structure are then kept to
             this tolerance only, and so are steps that `FixedStepAdjoint` takes
             backwards, whose `tol` must be larger. A hundredth of the error that is
-            wanted saves up to two thirds of the iterations. Defaults to 0, for iteration to
-            rounding.
+            wanted saves up to two thirds of the iterations. Defaults to 0, for
+            iteration to rounding.
 
         **Raises:**
 

@@ -9,7 +9,6 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import lineax as lx
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Inexact, PyTree, Shaped
@@ -241,17 +240,3 @@ def by_root_finder(
     found = solution.result == optx.RESULTS.successful
     results: Any = dfx.RESULTS
     return solution.value, results.where(found, results.successful, ROOT_NOT_FOUND)
-
-
-def factorise(g, y: Slopes) -> Slopes:
-    """Solve a linear system of a residual by a factorisation of the matrix."""
-
-    def solve(g, b):
-        operator = lx.FunctionLinearOperator(g, jax.eval_shape(lambda: b))
-        how = lx.AutoLinearSolver(well_posed=True)
-        solution = lx.linear_solve(operator, b, how, throw=False)
-        solved = solution.result == lx.RESULTS.successful
-        return jtu.tree_map(lambda x: jnp.where(solved, x, jnp.nan), solution.value)
-
-    # Not differentiated by Lineax, whose errors would end all members of a batch.
-    return lax.custom_linear_solve(g, y, solve, transpose_solve=solve)

@@ -9,6 +9,7 @@ import lineax as lx
 from jaxtyping import Array, Bool, Inexact
 
 from .. import _tree as tree
+from .._implicit import solve_linear
 
 
 Multipliers = Inexact[Array, " constraints"]
@@ -22,18 +23,9 @@ def solve(
     linear: LinearMap, b: Multipliers, solver: lx.AbstractLinearSolver | None
 ) -> Multipliers:
     """The solution of a linear system, by its matrix unless a solver is given; NaN if
-    there is none, in derivatives too, where Lineax itself would end a batch."""
-
-    def attempt(linear: LinearMap, b: Multipliers) -> Multipliers:
-        found = lx.linear_solve(
-            _operator(linear, b, solver),
-            b,
-            lx.LU() if solver is None else solver,
-            throw=False,
-        )
-        return tree.invalid_if(found.result != lx.RESULTS.successful, found.value)
-
-    return lax.custom_linear_solve(linear, b, attempt, attempt)
+    there is none."""
+    operator = lambda linear: _operator(linear, b, solver)
+    return solve_linear(linear, b, lx.LU() if solver is None else solver, operator)
 
 
 def _operator(
