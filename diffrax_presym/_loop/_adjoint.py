@@ -19,7 +19,7 @@ from ._kept import Checkpoints, Reversal
 from ._problem import Problem
 from ._run import run, saved_rows
 from ._steps import Steps, StepsBetween
-from ._variable import Clock, VariableSteps
+from ._variable import VariableSteps
 
 
 class FixedStepAdjoint(dfx.AbstractAdjoint):
@@ -119,14 +119,13 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         subs, structure = private.flatten_subs(saveat)
         if isinstance(stepsize_controller, StepDensityController):
             steps = VariableSteps(t0, t1, stepsize_controller)
-            carry = carry, Clock(t0, control)
         else:
             steps = Steps(stepsize_controller, t0, t1, dt0)
         problem = Problem(
             solver,
             system,
             subs,
-            (y, carry),
+            (y, steps.join(carry, control)),
             steps,
             max_steps,
             (progress_meter, meter),
@@ -230,16 +229,14 @@ def _final_state(problem: Problem, way: Reversal | Checkpoints, init_state, stru
     end, saved, n, result, meter = eqx.combine(
         out, eqxi.nondifferentiable_backward(counts)
     )
-    carry, control = end[1], None
-    if isinstance(problem.steps, VariableSteps):
-        carry, (_, control) = carry
+    carry, control = problem.steps.split(end[1])
     return private.final_state(
         init_state,
         structure,
         y=end[0],
         solver_state=carry,
         control=control,
-        t=problem.time(n, end),
+        t=problem.steps.begin(n, end),
         steps=n,
         result=result,
         meter=meter,

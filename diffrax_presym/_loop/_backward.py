@@ -163,7 +163,7 @@ class Backward(eqx.Module):
 
     def _pull_point(self, i: int, n: Array, point: Point, bar: PyTree):
         """Pull back an output saved at a step, to the functions and the state."""
-        (y, carry), time = point, self.problem.time(n, point)
+        (y, carry), time = point, self.problem.steps.begin(n, point)
         output = lambda functions, y: functions.outputs[i](time, y)
         gradient, y_bar = self.pull(output, bar, y)
         return gradient, (y_bar, _zeros(carry))

@@ -12,10 +12,10 @@ from jaxtyping import Array, Bool, PyTree
 from .. import _tree as tree
 from .._scheme._base import Point
 from ._backward import Backward, BackwardState
+from ._base import MOST_STEPS
 from ._problem import Problem
-from ._steps import MOST_STEPS
 from ._tracks import AbstractTrack, Track
-from ._variable import Kept, VariableSteps
+from ._variable import Kept
 
 
 # The least number of steps between two kept states, of a gradient by reversal.
@@ -57,9 +57,9 @@ class Reversal(eqx.Module):
         return _until(last, jnp.arange(most) * -(-last // parts))
 
     def track(self, problem: Problem) -> AbstractTrack:
-        if isinstance(problem.steps, VariableSteps):
-            return Kept(self.most + 1, problem.start)
-        return _track(self.places(problem), problem)
+        if problem.steps.are_known:
+            return _track(self.places(problem), problem)
+        return Kept(self.most + 1, problem.start)
 
     def pull_back(self, backward: Backward) -> BackwardState:
         problem, trace = backward.problem, backward.trace

@@ -17,7 +17,8 @@ from .. import _tree as tree
 from .._numbers import cast_to, State
 from .._scheme._base import Point, Scheme
 from .._system._bound import System
-from ._steps import Rows, Steps
+from ._rows import Rows
+from ._steps import Steps
 
 
 NODES = 4  # of a polynomial

@@ -1,7 +1,6 @@
 """A solve with steps known beforehand or reversible, as functions of states alone."""
 
 from collections.abc import Callable
-from functools import partial
 
 import diffrax as dfx
 import equinox as eqx
@@ -12,13 +11,13 @@ from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 from .. import _tree as tree
 from .._numbers import Scalar, State
 from .._results import NONFINITE
-from .._scheme._base import AbstractPresymplecticSolver, advance, between, Point
-from .._scheme._engine import backward, is_autonomous, prepare, prepare_once, Result
-from .._scheme._failure import explain, unless_too_strong
+from .._scheme._base import AbstractPresymplecticSolver, Point
+from .._scheme._engine import Result
 from .._system._bound import System
+from ._base import AbstractSteps
 from ._nodes import derivatives, Node, Stencils, Ways
-from ._steps import Rows, Steps
-from ._variable import VariableSteps
+from ._rows import Rows
+from ._steps import Steps
 
 
 class Functions(eqx.Module):
@@ -46,7 +45,7 @@ class Problem(eqx.Module):
     # The result of so many steps to an end, from one without its reason.
     explain: Callable[[Array, Point, dfx.RESULTS], dfx.RESULTS]
     growth: Scalar | None  # of rounding errors backwards in time, its logarithm
-    steps: Steps | VariableSteps
+    steps: AbstractSteps
     rows: list[Rows]
     subs: list[dfx.SubSaveAt]  # without their functions
     max_steps: int | None = eqx.field(static=True)
@@ -60,58 +59,35 @@ class Problem(eqx.Module):
         system: System,
         subs: list[dfx.SubSaveAt],
         start: Point,
-        steps: Steps | VariableSteps,
+        steps: AbstractSteps,
         max_steps: int | None,
         meters: tuple[dfx.AbstractProgressMeter, PyTree],
         reversal: bool,
     ):
         scheme, t0, n = solver.scheme(system), steps.t0, jnp.zeros((), int)
-        equal = isinstance(steps, Steps) and steps.are_equal
-        once = equal and is_autonomous(scheme.moves, system)
-
-        def prepared(backward: bool) -> PyTree:
-            if not once or isinstance(steps, VariableSteps):
-                return None
-            span, most = steps.span(system, n), scheme.most_friction
-            data = prepare_once(scheme.moves, system, span, backward)
-            return data if backward else unless_too_strong(most, system, span, data)
-
-        data = prepared(False)
+        data = steps.prepare(scheme, system, backward=False)
 
         def step(n: Array, point: Point) -> tuple[Point, Result]:
-            if isinstance(steps, VariableSteps):
-                return steps.step(scheme, system, point)
-            return advance(scheme, system, steps.span(system, n), point, data)
+            return steps.step(scheme, system, n, point, data)
 
         def shorter(n: Array, point: Point, t: Array) -> State:
-            if isinstance(steps, VariableSteps):
-                return steps.shorter(scheme, system, point, t)
-            t0, t = system.time(steps.time(n)), system.time(t)
-            return between(scheme, system, t0, point, t)
+            return steps.shorter(scheme, system, n, point, t)
 
         def explained(n: Array, end: Point, result: dfx.RESULTS) -> dfx.RESULTS:
-            if isinstance(steps, VariableSteps):
-                return result  # Each step says why it fails.
-            time = lambda n, point: system.time(self.time(n, point))
-            ends = (time(0 * n, start), start), (time(n, end), end)
-            span = partial(steps.span, system)
-            return explain(scheme, system, span, n, ends, result)
+            return steps.explain(scheme, system, n, (start, end), result)
 
         self.rows = [Rows(sub, steps, max_steps) for sub in subs]
         some = any(rows.may_be_inside for rows in self.rows)
         convert = eqx.filter_closure_convert
-        self.steps, self.max_steps = steps, max_steps
-        if isinstance(steps, VariableSteps):
-            # Where steps end is differentiated as part of the functions.
-            fixed = tree.stop_gradient(steps.controller)
-            self.steps = eqx.tree_at(lambda x: x.controller, steps, fixed)
+        # Where steps end is differentiated as part of the functions.
+        self.steps, self.max_steps = steps.without_gradient(), max_steps
         self.stencils = [None] * len(self.rows)
         at_node = None
         resolved = scheme.is_resolved and solver.order(None) > 2
         if isinstance(steps, Steps) and some and resolved:
             at_node = convert(
                 lambda n, side, point: derivatives(
-                    scheme, system, self.time(n, point), side, point
+                    scheme, system, steps.time(n), side, point
                 ),
                 *(n, n, start),
             )
@@ -134,23 +110,10 @@ class Problem(eqx.Module):
         self.explain = convert(explained, n, start, result)
         self.undo = self.growth = None
         if reversal:
-            back = prepared(True)
-
-            def undo(n: Array, point: Point) -> Point:
-                if isinstance(steps, VariableSteps):
-                    return steps.undo(scheme, system, point)
-                span, data = steps.span(system, n), back
-                if not once:
-                    data = prepare(scheme.moves, system, span, backward=True)
-                return backward(scheme.moves, system, span, data, point)
-
+            back = steps.prepare(scheme, system, backward=True)
+            undo = lambda n, point: steps.undo(scheme, system, n, point, back)
             self.undo = convert(undo, n, start)
-            if system.friction is not None and isinstance(steps, Steps):
-                # The first step after a kept state is not inverted.
-                first = jnp.minimum(jnp.ones((), int), self.last)
-                begin, end = (system.time(steps.time(n)) for n in (first, self.last))
-                growth = system.friction.growth(begin, end - begin)
-                self.growth = lax.stop_gradient(growth)
+            self.growth = steps.growth(system, self.last)
         without_fn = lambda sub: eqx.tree_at(lambda x: x.fn, sub, None)
         self.subs = list(map(without_fn, subs))
         self.progress_meter, self.meter = meters
@@ -167,16 +130,6 @@ class Problem(eqx.Module):
         total = self.steps.total
         return total if self.max_steps is None else jnp.minimum(total, self.max_steps)
 
-    def time(self, n: Array, point: Point) -> Array:
-        """The time of the start of step `n`."""
-        steps = self.steps
-        return steps.time(n) if isinstance(steps, Steps) else steps.clock(point).t
-
-    def ended(self, n: Array, point: Point) -> Bool[Array, ""]:
-        """Whether the solve has come to its end."""
-        steps = self.steps
-        return n >= steps.total if isinstance(steps, Steps) else steps.ended(point)
-
     def between(
         self,
         functions: Functions,
@@ -188,11 +141,9 @@ class Problem(eqx.Module):
     ) -> PyTree:
         """The state at a time `inside` step `n`, or at its start; that of the `shorter`
         step or of the start if it is known which."""
-        if isinstance(self.steps, Steps):
-            last, begin, end = (self.steps.time(n + i) for i in (-1, 0, 1))
-        else:
-            last = begin = self.time(n, start)
-            end = self.steps.next(start)
+        steps = self.steps
+        last, begin = steps.previous(n, start), steps.begin(n, start)
+        end = steps.end(n, start)
         # A batch computes the shorter step at the start of a step too, and after the
         # last one. Its result is not used, but it must be one that succeeds: half of a
         # step, the last one at the end of the solve, as friction that is singular at

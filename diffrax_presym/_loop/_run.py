@@ -6,7 +6,6 @@ one to the next without asking. Between steps the solution is interpolated from 
 of several, or a shorter step of the scheme.
 """
 
-from functools import reduce
 from typing import Any
 
 import diffrax as dfx
@@ -20,10 +19,11 @@ from .. import _tree as tree
 from .._results import NONFINITE
 from .._scheme._base import Point
 from .._scheme._engine import cheap_iterations
+from ._base import MOST_STEPS, Stop
 from ._problem import Problem
-from ._steps import Rows
+from ._rows import Rows
 from ._tracks import AbstractTrack, Interpolated, put, Track
-from ._variable import Timed, VariableSteps
+from ._variable import Timed
 
 
 # The steps of a loop whose length is known, for which the host does not wait on a GPU.
@@ -64,7 +64,7 @@ def run(problem: Problem, kept: AbstractTrack | None = None):
     for i, (at_steps, inside) in enumerate(stacked):
         values, ys, rows = None, None, problem.rows[i]
         if at_steps is not None:
-            if isinstance(problem.steps, VariableSteps):
+            if not problem.steps.are_known:
                 found, at_steps = at_steps
                 rows = rows.found(*found)
             values, each = at_steps
@@ -85,7 +85,8 @@ def run(problem: Problem, kept: AbstractTrack | None = None):
     bad = (result == success) & ~finite
     result = dfx.RESULTS.where(bad, NONFINITE, result)
     result = problem.explain(progress.n, progress.point, result)
-    short = (result == success) & ~problem.ended(progress.n, progress.point)
+    ended = problem.steps.ended(progress.n, progress.point)
+    short = (result == success) & ~ended
     result = dfx.RESULTS.where(short, dfx.RESULTS.max_steps_reached, result)
     before = progress.before
     trace = Trace(progress.n, progress.point, between, kept_states, before, all_rows)
@@ -102,7 +103,7 @@ def _tracks(
         return None, None
     y, output = problem.start[0], functions.outputs[i]
     init, due = output(problem.steps.t0, y), rows.reached(problem.last)
-    if isinstance(problem.steps, VariableSteps):
+    if not problem.steps.are_known:
         found = lambda j, n, inside, point: problem.output(
             i, functions, j, point, found=(n, inside)
         )
@@ -124,16 +125,16 @@ def _tracks(
 def _walk(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
     """All steps, stopping where a value of a track is due."""
     steps, last, meter = problem.steps, problem.last, problem.progress_meter
-    varies, keeps = isinstance(steps, VariableSteps), tracks[1] is not None
+    may_be_cut = not steps.are_known and tracks[1] is not None
 
     def step(progress: Progress) -> Progress:
         n, point = progress.n, progress.point
         end, result = problem.functions.step(n, point)
-        done = (problem.time(n + 1, end) - steps.t0) / (steps.t1 - steps.t0)
-        before = point if varies and keeps else None
+        done = (steps.begin(n + 1, end) - steps.t0) / (steps.t1 - steps.t0)
+        before = point if may_be_cut else None
         return Progress(n + 1, end, result, meter.step(progress.meter, done), before)
 
-    before = problem.start if varies and keeps else None
+    before = problem.start if may_be_cut else None
     zero = jnp.zeros((), int)
     start = Progress(zero, problem.start, None, problem.meter, before)
     can_fail = eqx.filter_eval_shape(step, start).result is not None
@@ -141,26 +142,18 @@ def _walk(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
         success = jtu.tree_map(jnp.asarray, dfx.RESULTS.successful)
         start = eqx.tree_at(lambda x: x.result, start, success, is_leaf=_is_none)
 
-    def unfinished(
-        progress: Progress, stop: Array, time: Array | None = None
-    ) -> Bool[Array, ""]:
-        left = progress.n < stop
-        if isinstance(steps, VariableSteps):
-            left &= ~steps.ended(progress.point)
-            if time is not None:
-                left &= steps.next(progress.point) <= time
-        if not can_fail:
-            return left
-        return left & (progress.result == dfx.RESULTS.successful)
+    def good(progress: Progress) -> Any:
+        return True if not can_fail else progress.result == dfx.RESULTS.successful
 
-    def advance_to(
-        stop: Array, progress: Progress, time: Array | None = None
-    ) -> Progress:
+    def unfinished(progress: Progress, stop: Stop) -> Bool[Array, ""]:
+        return steps.before(stop, progress.n, progress.point) & good(progress)
+
+    def advance_to(stop: Stop, progress: Progress) -> Progress:
         if not (cheap_iterations() or can_fail):
             block = lambda x: lax.fori_loop(0, _BLOCK, lambda _, x: step(x), x)
-            several = lambda progress: progress.n + _BLOCK <= stop
+            several = lambda progress: progress.n + _BLOCK <= stop.n
             progress = lax.while_loop(several, block, progress)
-        return lax.while_loop(lambda x: unfinished(x, stop, time), step, progress)
+        return lax.while_loop(lambda x: unfinished(x, stop), step, progress)
 
     is_track = lambda x: isinstance(x, AbstractTrack)
     flat, structure = jtu.tree_flatten(tracks, is_leaf=is_track)
@@ -168,53 +161,30 @@ def _walk(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
         track.due(state) for track, state in zip(flat, states, strict=True)
     ]
 
-    def time(states) -> Array | None:
-        """The next time at which the state is wanted, if steps are not known."""
-        each = [
-            track.time(state)
-            for track, state in zip(flat, states, strict=True)
-            if isinstance(track, Timed)
-        ]
-        return reduce(jnp.minimum, each) if each else None
-
-    def now(progress: Progress, time: Array) -> Bool[Array, ""]:
-        """Whether that is before the end of the next step."""
-        assert isinstance(steps, VariableSteps)
-        point, last = progress.point, steps.t1
-        return (time < steps.next(point)) | (steps.ended(point) & (time <= last))
-
     def stop(x):
         progress, states = x
         wanted = due(states)
-        at = reduce(jnp.minimum, wanted, last)
-        progress, new = advance_to(at, progress, time(states)), []
+        first, new = steps.next_stop(wanted, last), []
+        progress = advance_to(first, progress)
+        n, point = steps.number(first, progress.n), progress.point
         for track, state, next_stop in zip(flat, states, wanted, strict=True):
-            if isinstance(track, Timed):
-                here = now(progress, track.time(state))
-            else:
-                here = (progress.n if varies else at) == next_stop
-            visit = lambda track=track, state=state: track.visit(
-                state, progress.n if varies else at, progress.point
-            )
+            visit = lambda track=track, state=state: track.visit(state, n, point)
+            here = steps.at(next_stop, n, point)
             new.append(lax.cond(here, visit, lambda state=state: state))
         return progress, new
 
     def more(x):
-        progress, states = x
-        some = unfinished(progress, last)
-        if varies:
-            wanted = time(states)
-            if wanted is not None:
-                good = progress.result == dfx.RESULTS.successful
-                some |= now(progress, wanted) & good
-        else:
-            some |= reduce(jnp.minimum, due(states)) <= last
+        (progress, states), end = x, Stop(last)
+        n, point = progress.n, progress.point
+        first = steps.next_stop(due(states), jnp.asarray(MOST_STEPS, last.dtype))
+        some = unfinished(progress, end)
+        some |= steps.is_left(first, last, n, point) & good(progress)
         # Steps from a state that is not finite are of no use.
-        return some & tree.all_finite(progress.point[0])
+        return some & tree.all_finite(point[0])
 
     states = [track.start() for track in flat]
     if not flat:
-        return advance_to(last, start), jtu.tree_unflatten(structure, [])
+        return advance_to(Stop(last), start), jtu.tree_unflatten(structure, [])
     # The end is a stop too, so that there is one loop over steps.
     end, states = lax.while_loop(more, stop, (start, states))
     rows = [track.rows(state) for track, state in zip(flat, states, strict=True)]
@@ -252,7 +222,7 @@ def saved_rows(
     if sub.t1:
         separate = end_is_separate(sub, n)
         if separate is not None:
-            time = problem.time(n, progress.point)
+            time = steps.begin(n, progress.point)
             value = output(time, progress.point[0])
             ts = put(ts, number, time, separate)
             ys, number = put(ys, number, value, separate), number + 1

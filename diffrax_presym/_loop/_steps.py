@@ -1,6 +1,7 @@
-"""The steps of a solve that are known beforehand, and in which of them it is saved."""
+"""The steps of a solve that are known beforehand."""
 
-from typing import Any
+from functools import partial, reduce
+from typing import Any, ClassVar
 
 import diffrax as dfx
 import equinox as eqx
@@ -12,12 +13,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._checks import as_finite
 from .._numbers import cast_to
-from .._scheme._engine import Span
+from .._scheme._base import advance, Scheme
+from .._scheme._engine import backward, is_autonomous, prepare, prepare_once, Span
+from .._scheme._failure import explain, unless_too_strong
 from .._system._bound import System
+from ._base import AbstractSteps, MOST_STEPS, Stop
 
 
-# More than any solve takes, in integers of either precision.
-MOST_STEPS = 2**30
 _OTHER_ENDS = (
     "The first and the last time of `diffrax.StepTo(ts)` must be `t0` and `t1` of the "
     "solve. Write `StepTo(jnp.concatenate([t0, ts, t1]))`, or use "
@@ -92,13 +94,15 @@ class StepsBetween(dfx.AbstractStepSizeController):
         return True, t1, steps.time(n + 1), kink, state, dfx.RESULTS.successful
 
 
-class Steps(eqx.Module):
+class Steps(AbstractSteps):
     """Steps that are equal between given times, the ends of a solve if there are none,
     or prescribed ones."""
 
+    are_known: ClassVar[bool] = True
+
     t0: Float[Array, ""]
     t1: Float[Array, ""]
-    total: Int[Array, ""]
+    count: Int[Array, ""]
     starts: Float[Array, " parts"]  # of the spans of equal steps
     first: Int[Array, " parts"]  # the first step of each of them
     length: Float[Array, " parts"]  # of its steps
@@ -109,7 +113,7 @@ class Steps(eqx.Module):
         if isinstance(controller, dfx.StepTo):
             ends = (controller.ts[0] == t0) & (controller.ts[-1] == t1)
             self.ts = eqx.error_if(controller.ts, ~ends, _OTHER_ENDS)
-            self.total = jnp.asarray(len(controller.ts) - 1)
+            self.count = jnp.asarray(len(controller.ts) - 1)
             self.starts, self.first = t0[None], jnp.zeros(1, int)
             self.length = jnp.zeros_like(self.starts)
             return
@@ -132,15 +136,18 @@ class Steps(eqx.Module):
         several = jnp.where(finite, jnp.maximum(numbers, 1), 1)
         self.length = jnp.where(finite, spans / several, dt0)
         last = counts if len(counts) == 1 else jnp.cumsum(counts)
-        self.first, self.total = last - counts, last[-1]
+        self.first, self.count = last - counts, last[-1]
+
+    @property
+    def total(self):
+        return self.count
 
     @property
     def are_equal(self) -> bool:
         return self.ts is None and len(self.starts) == 1
 
     @property
-    def kinks(self) -> Int[Array, " kinks"] | None:
-        """The steps that start at one of the given times, if there are any."""
+    def kinks(self):
         return None if len(self.starts) == 1 else self.first[1:]
 
     def _part(self, n: Int[Array, "..."]) -> Any:
@@ -219,6 +226,76 @@ class Steps(eqx.Module):
             t1 = jnp.where(end == self.first[after], self.starts[after], t1)
         return Span(*map(system.time, (t0, t1, self.length[k])))
 
+    def begin(self, n, point):
+        return self.time(n)
+
+    def end(self, n, point):
+        return self.time(n + 1)
+
+    def previous(self, n, point):
+        return self.time(n - 1)
+
+    def ended(self, n, point):
+        return n >= self.total
+
+    def next_stop(self, stops, last):
+        return Stop(reduce(jnp.minimum, [stop.n for stop in stops], last))
+
+    def before(self, stop, n, point):
+        return n < stop.n
+
+    def at(self, stop, n, point):
+        return n == stop.n
+
+    def number(self, stop, n):
+        return stop.n  # the same for all members of a batch
+
+    def is_left(self, stop, last, n, point):
+        return stop.n <= last
+
+    def join(self, carry, control):
+        return carry
+
+    def split(self, carry):
+        return carry, None
+
+    def _prepares_once(self, scheme: Scheme, system: System) -> bool:
+        return self.are_equal and is_autonomous(scheme.moves, system)
+
+    def prepare(self, scheme, system, backward):
+        if not self._prepares_once(scheme, system):
+            return None
+        span = self.span(system, jnp.zeros((), int))
+        data = prepare_once(scheme.moves, system, span, backward)
+        if backward:
+            return data
+        return unless_too_strong(scheme.most_friction, system, span, data)
+
+    def step(self, scheme, system, n, point, data):
+        return advance(scheme, system, self.span(system, n), point, data)
+
+    def undo(self, scheme, system, n, point, data):
+        span = self.span(system, n)
+        if not self._prepares_once(scheme, system):
+            data = prepare(scheme.moves, system, span, backward=True)
+        return backward(scheme.moves, system, span, data, point)
+
+    def explain(self, scheme, system, n, ends, result):
+        times = [system.time(self.time(i)) for i in (0 * n, n)]
+        timed = list(zip(times, ends, strict=True))
+        return explain(scheme, system, partial(self.span, system), n, timed, result)
+
+    def growth(self, system, last):
+        if system.friction is None:
+            return None
+        # The first step after a kept state is not inverted.
+        first = jnp.minimum(jnp.ones((), int), last)
+        begin, end = (system.time(self.time(n)) for n in (first, last))
+        return lax.stop_gradient(system.friction.growth(begin, end - begin))
+
+    def without_gradient(self):
+        return self
+
     def locate(
         self, ts: Float[Array, " times"]
     ) -> tuple[Int[Array, " times"], Bool[Array, " times"]]:
@@ -246,63 +323,3 @@ class Steps(eqx.Module):
         inside = jnp.abs(ts - start) > jnp.minimum(rounding, length / 64)
         inside &= self.total > 0
         return jnp.where(inside & (ts < start), n - 1, n), inside
-
-
-class Rows(eqx.Module):
-    """What one of `SaveAt(subs=...)` saves between the ends of a solve, in order."""
-
-    time: Float[Array, " rows"]
-    # The step from whose start it is computed; -1 if its time is not a number, a gap in
-    # measured times, for which nothing is saved.
-    stop: Int[Array, " rows"]
-    inside: Bool[Array, " rows"]  # whether it is within that step
-    known: Int[Array, " rows"]  # the number of steps after which it is known
-    of_ts: Bool[Array, " rows"]  # whether it is of `ts`
-    may_be_inside: bool = eqx.field(static=True)
-
-    def __init__(self, sub: dfx.SubSaveAt, steps: Any, max_steps: int | None):
-        times, stops, insides = [], [], []
-        self.may_be_inside = sub.ts is not None and len(sub.ts) > 0
-        if sub.ts is not None:
-            times.append(sub.ts)
-            gap, (stop, inside) = jnp.isnan(sub.ts), steps.locate(sub.ts)
-            stops.append(jnp.where(gap, -1, stop))
-            insides.append(inside & ~gap)
-        number = 0 if sub.ts is None else len(sub.ts)
-        if sub.steps:
-            assert max_steps is not None  # as Diffrax has checked
-            n = sub.steps * jnp.arange(1, max_steps // sub.steps + 1)
-            times.append(steps.time(n))
-            stops.append(n)
-            insides.append(jnp.zeros_like(n, bool))
-        join = lambda x: jnp.concatenate(x) if x else jnp.zeros(0, int)
-        time, stop, inside = map(join, (times, stops, insides))
-        of_ts = jnp.arange(len(time)) < number
-        if len(times) > 1:
-            # Diffrax saves the times in a step before its end.
-            order = jnp.lexsort((~of_ts, jnp.where(stop > steps.total, jnp.inf, time)))
-            time, stop, inside, of_ts = (x[order] for x in (time, stop, inside, of_ts))
-        self.time, self.stop, self.inside, self.of_ts = time, stop, inside, of_ts
-        self.known = stop + jnp.where(inside, 1, 0)
-
-    def known_after(self, number: Int[Array, " rows"]) -> "Rows":
-        """The same, of which each is known after another number of steps."""
-        return eqx.tree_at(lambda self: self.known, self, number)
-
-    def found(self, stop: Array, inside: Array) -> "Rows":
-        """The same, of which the steps have been found."""
-        gap = jnp.isnan(self.time)
-        stop, inside = jnp.where(gap, -1, stop), inside & ~gap
-        new = stop, inside, stop + jnp.where(inside, 1, 0)
-        return eqx.tree_at(lambda self: (self.stop, self.inside, self.known), self, new)
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-    def reached(self, n: Int[Array, ""]) -> Bool[Array, " rows"]:
-        """Which rows are known after `n` steps."""
-        return self.known <= n
-
-    def taken(self, n: Int[Array, ""]) -> Bool[Array, " rows"]:
-        """Which of these have a value."""
-        return self.reached(n) & (self.stop >= 0)

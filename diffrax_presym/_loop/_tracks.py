@@ -13,6 +13,7 @@ from jaxtyping import Array, Int, PyTree
 from .. import _tree as tree
 from .._numbers import cast_to, State
 from .._scheme._base import Point
+from ._base import Stop
 from ._nodes import Node, NODES, Stencils
 
 
@@ -27,12 +28,12 @@ class AbstractTrack(eqx.Module):
         """The state before the first step."""
 
     @abc.abstractmethod
-    def due(self, state: PyTree) -> Int[Array, ""]:
-        """The next step that is wanted."""
+    def due(self, state: PyTree) -> Stop:
+        """Where a state is wanted next."""
 
     @abc.abstractmethod
     def visit(self, state: PyTree, n: Array, point: Point) -> PyTree:
-        """The state after the start of that step."""
+        """The state after that, at the start of step `n`."""
 
     @abc.abstractmethod
     def rows(self, state: PyTree) -> PyTree:
@@ -54,7 +55,7 @@ class Track(AbstractTrack):
         return jnp.zeros((), int), stack(self.init, len(self.stops) - 1)
 
     def due(self, state):
-        return self.stops[state[0]]
+        return Stop(self.stops[state[0]])
 
     def visit(self, state, n, point):
         j, rows = state
@@ -82,7 +83,7 @@ class Interpolated(AbstractTrack):
 
     def due(self, state):
         n, j, *_ = state
-        return jnp.maximum(n, self.stencils.first[j])
+        return Stop(jnp.maximum(n, self.stencils.first[j]))
 
     def visit(self, state, n, point):
         _, j, ring, rows, finite = state

@@ -6,20 +6,20 @@ dependence of all steps on the states before them.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import reduce
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
-from .._numbers import State
-from .._scheme._base import advance, between, check_step, Point, Scheme
-from .._scheme._engine import backward, first_failure, prepare, Result, Span
+from .. import _tree as tree
+from .._scheme._base import advance, check_step, Point
+from .._scheme._engine import backward, first_failure, prepare, Span
 from .._step_size._density import StepDensityController
-from .._system._bound import System
-from ._steps import MOST_STEPS
+from ._base import AbstractSteps, MOST_STEPS, Stop
 from ._tracks import AbstractTrack, put, stack
 
 
@@ -30,40 +30,82 @@ class Clock(NamedTuple):
     control: Float[Array, ""]
 
 
-class VariableSteps(eqx.Module):
+class VariableSteps(AbstractSteps):
     """Steps of a controller, from one end of a solve to the other."""
 
     t0: Float[Array, ""]
     t1: Float[Array, ""]
     controller: StepDensityController
-    kinks: None = None  # Nothing is known of jumps.
+    are_known: ClassVar[bool] = False
 
     @property
-    def total(self) -> Int[Array, ""]:
-        """The largest number of steps: how many there are is not known."""
+    def total(self):
         return jnp.asarray(MOST_STEPS)
 
-    def locate(self, ts: Float[Array, " times"]) -> tuple[Array, Array]:
-        """The step in which each time is: not known yet."""
+    @property
+    def kinks(self):
+        return None  # Nothing is known of jumps.
+
+    def locate(self, ts):
         return jnp.full(ts.shape, MOST_STEPS), jnp.ones(ts.shape, bool)
 
-    def clock(self, point: Point) -> Clock:
+    def _clock(self, point: Point) -> Clock:
         return point[1][1]
 
-    def ended(self, point: Point) -> Bool[Array, ""]:
-        return self.clock(point).t >= self.t1
+    def begin(self, n, point):
+        return self._clock(point).t
 
-    def next(self, point: Point) -> Float[Array, ""]:
-        """The end of the next step; the last one is cut off at the end of the solve."""
-        t, control = self.clock(point)
+    def end(self, n, point):
+        # The last one is cut off at the end of the solve.
+        t, control = self._clock(point)
         end = t + self.controller.step_size(control)
         rounding = 4 * jnp.finfo(t.dtype).eps * jnp.maximum(abs(self.t0), abs(self.t1))
         return jnp.where(end > self.t1 - rounding, self.t1, end)
 
-    def step(
-        self, scheme: Scheme, system: System, point: Point
-    ) -> tuple[Point, Result]:
-        (y, (carry, (t, control))), end = point, self.next(point)
+    def previous(self, n, point):
+        return self.begin(n, point)
+
+    def ended(self, n, point):
+        return self.begin(n, point) >= self.t1
+
+    def next_stop(self, stops, last):
+        times = [stop.time for stop in stops if stop.time is not None]
+        n = reduce(jnp.minimum, [stop.n for stop in stops], last)
+        return Stop(n, reduce(jnp.minimum, times) if times else None)
+
+    def before(self, stop, n, point):
+        left = (n < stop.n) & ~self.ended(n, point)
+        return left if stop.time is None else left & (self.end(n, point) <= stop.time)
+
+    def at(self, stop, n, point):
+        here = n == stop.n
+        return here if stop.time is None else here | self._within(stop.time, n, point)
+
+    def _within(self, time: Array, n: Array, point: Point) -> Bool[Array, ""]:
+        """Whether a time is before the end of the next step."""
+        last = self.ended(n, point) & (time <= self.t1)
+        return (time < self.end(n, point)) | last
+
+    def number(self, stop, n):
+        return n
+
+    def is_left(self, stop, last, n, point):
+        if stop.time is None:
+            return jnp.asarray(False)
+        return self._within(stop.time, n, point)
+
+    def join(self, carry, control):
+        return carry, Clock(self.t0, control)
+
+    def split(self, carry):
+        carry, (_, control) = carry
+        return carry, control
+
+    def prepare(self, scheme, system, backward):
+        return None
+
+    def step(self, scheme, system, n, point, data):
+        (y, (carry, (t, control))), end = point, self.end(n, point)
         h = jnp.where(end < self.t1, self.controller.step_size(control), end - t)
         span, start = Span(*map(system.time, (t, end, h))), (y, carry)
         (y1, carry), result = advance(scheme, system, span, start)
@@ -73,8 +115,8 @@ class VariableSteps(eqx.Module):
         )
         return (y1, (carry, Clock(end, control))), first_failure(result, failed)
 
-    def undo(self, scheme: Scheme, system: System, point: Point) -> Point:
-        """The inverse of a step, unless that was cut off."""
+    def undo(self, scheme, system, n, point, data):
+        # But for one that was cut off.
         y, (carry, (t, control)) = point
         control = self.controller.reverse(t, y, system.args, control)
         h = self.controller.step_size(control)
@@ -83,10 +125,15 @@ class VariableSteps(eqx.Module):
         y, carry = backward(scheme.moves, system, span, data, (y, carry))
         return y, (carry, Clock(t - h, control))
 
-    def shorter(self, scheme: Scheme, system: System, point: Point, t: Array) -> State:
-        """The state at a time within the next step."""
-        y, (carry, clock) = point
-        return between(scheme, system, system.time(clock.t), (y, carry), system.time(t))
+    def explain(self, scheme, system, n, ends, result):
+        return result
+
+    def growth(self, system, last):
+        return None
+
+    def without_gradient(self):
+        fixed = tree.stop_gradient(self.controller)
+        return eqx.tree_at(lambda x: x.controller, self, fixed)
 
 
 class Timed(AbstractTrack):
@@ -103,15 +150,12 @@ class Timed(AbstractTrack):
         return jnp.zeros((), int), found, stack(self.init, number)
 
     def due(self, state):
-        return jnp.asarray(MOST_STEPS)  # by its time
-
-    def time(self, state) -> Float[Array, ""]:
-        """The next time; at once if that is a gap in measured times."""
         j, *_ = state
         t = self.times[jnp.minimum(j, len(self.times) - 1)]
-        return jnp.where(
-            j < len(self.times), jnp.where(jnp.isnan(t), -jnp.inf, t), jnp.inf
-        )
+        # At once if that is a gap in measured times.
+        t = jnp.where(jnp.isnan(t), -jnp.inf, t)
+        left = j < len(self.times)
+        return Stop(jnp.asarray(MOST_STEPS), jnp.where(left, t, jnp.inf))
 
     def visit(self, state, n, point):
         j, (stops, insides), rows = state
@@ -135,7 +179,7 @@ class Kept(AbstractTrack):
 
     def due(self, state):
         count, every, _ = state
-        return count * every
+        return Stop(count * every)
 
     def visit(self, state, n, point):
         count, every, rows = state

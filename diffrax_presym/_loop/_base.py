@@ -1,0 +1,147 @@
+"""What the loop asks of the steps of a solve."""
+
+import abc
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from .._numbers import Scalar, State
+from .._scheme._base import between, Point, Scheme
+from .._scheme._engine import Result
+from .._system._bound import System
+
+
+# More than any solve takes, in integers of either precision.
+MOST_STEPS = 2**30
+
+
+class Stop(NamedTuple):
+    """Where a state is wanted next: at the start of a step, or at a time; `None` where
+    all that is wanted is at steps that are known."""
+
+    n: Int[Array, ""]
+    time: Float[Array, ""] | None = None
+
+
+class AbstractSteps(eqx.Module):
+    """The steps of a solve from `t0` to `t1`: where they end, and how one is taken.
+
+    A step is given by its number and the point it starts from. Of these two, steps that
+    are known beforehand use the number, and others the point.
+    """
+
+    t0: eqx.AbstractVar[Float[Array, ""]]
+    t1: eqx.AbstractVar[Float[Array, ""]]
+    are_known: eqx.AbstractClassVar[bool]
+
+    @property
+    @abc.abstractmethod
+    def total(self) -> Int[Array, ""]:
+        """The number of steps, or the largest that there may be."""
+
+    @property
+    @abc.abstractmethod
+    def kinks(self) -> Int[Array, " kinks"] | None:
+        """The steps that start where derivatives jump, if there may be any."""
+
+    @abc.abstractmethod
+    def locate(self, ts: Float[Array, " times"]) -> tuple[Array, Array]:
+        """The step in which each time is, and whether it is inside of that or at its
+        start."""
+
+    @abc.abstractmethod
+    def begin(self, n: Array, point: Point) -> Float[Array, ""]:
+        """The start of a step."""
+
+    @abc.abstractmethod
+    def end(self, n: Array, point: Point) -> Float[Array, ""]:
+        """The end of a step."""
+
+    @abc.abstractmethod
+    def previous(self, n: Array, point: Point) -> Float[Array, ""]:
+        """The start of the step before, if that is known."""
+
+    @abc.abstractmethod
+    def ended(self, n: Array, point: Point) -> Bool[Array, ""]:
+        """Whether that is the end of the solve."""
+
+    # How the loop goes from stop to stop.
+
+    @abc.abstractmethod
+    def next_stop(self, stops: Sequence[Stop], last: Int[Array, ""]) -> Stop:
+        """The first of some stops, and of the end of the last step."""
+
+    @abc.abstractmethod
+    def before(self, stop: Stop, n: Array, point: Point) -> Bool[Array, ""]:
+        """Whether a step from here ends at the stop or before."""
+
+    @abc.abstractmethod
+    def at(self, stop: Stop, n: Array, point: Point) -> Bool[Array, ""]:
+        """Whether the state here is that of the stop."""
+
+    @abc.abstractmethod
+    def number(self, stop: Stop, n: Array) -> Int[Array, ""]:
+        """Of the step where the loop came to, on its way to a stop."""
+
+    @abc.abstractmethod
+    def is_left(
+        self, stop: Stop, last: Array, n: Array, point: Point
+    ) -> Bool[Array, ""]:
+        """Whether a stop from here on is not later than the end of the last step."""
+
+    # How a step is taken.
+
+    @abc.abstractmethod
+    def join(self, carry: PyTree, control: PyTree) -> PyTree:
+        """The solver state of the loop, with that of a controller."""
+
+    @abc.abstractmethod
+    def split(self, carry: PyTree) -> tuple[PyTree, PyTree]:
+        """The two again."""
+
+    @abc.abstractmethod
+    def prepare(self, scheme: Scheme, system: System, backward: bool) -> PyTree:
+        """What is the same for all steps."""
+
+    @abc.abstractmethod
+    def step(
+        self, scheme: Scheme, system: System, n: Array, point: Point, data: PyTree
+    ) -> tuple[Point, Result]:
+        """Take a step."""
+
+    @abc.abstractmethod
+    def undo(
+        self, scheme: Scheme, system: System, n: Array, point: Point, data: PyTree
+    ) -> Point:
+        """The inverse of a step, of its number and its end."""
+
+    def shorter(
+        self, scheme: Scheme, system: System, n: Array, point: Point, t: Array
+    ) -> State:
+        """The state at a time within a step."""
+        t0, (y, carry) = self.begin(n, point), point
+        start = y, self.split(carry)[0]
+        return between(scheme, system, system.time(t0), start, system.time(t))
+
+    @abc.abstractmethod
+    def explain(
+        self,
+        scheme: Scheme,
+        system: System,
+        n: Array,
+        ends: tuple[Point, Point],
+        result: dfx.RESULTS,
+    ) -> dfx.RESULTS:
+        """The result of so many steps between two ends, with the reason of a failure,
+        unless each step has given it."""
+
+    @abc.abstractmethod
+    def growth(self, system: System, last: Array) -> Scalar | None:
+        """Of rounding errors backwards in time over all steps, its logarithm."""
+
+    @abc.abstractmethod
+    def without_gradient(self) -> "AbstractSteps":
+        """The same, where what is differentiated are the functions of a solve."""
