@@ -266,8 +266,8 @@ MUTANTS = [
     Mutant(
         "a last step is left out",
         "_loop/_steps.py",
-        "self.first, self.total = last - counts, last[-1]",
-        "self.first, self.total = last - counts, last[-1] - 1",
+        "self.first, self.count = last - counts, last[-1]",
+        "self.first, self.count = last - counts, last[-1] - 1",
         ("end",),
     ),
     Mutant(
@@ -278,10 +278,53 @@ MUTANTS = [
         ("reversal",),
     ),
     Mutant(
+        "variable steps do not depend on the state in gradients",
+        "_loop/_variable.py",
+        "h = jnp.where(end < self.t1, self.controller.step_size(control), end - t)",
+        "control = lax.stop_gradient(control)\n        "
+        "h = jnp.where(end < self.t1, self.controller.step_size(control), end - t)",
+        tests="test_step_density.py",
+    ),
+    Mutant(
+        "the controller is not run backwards",
+        "_loop/_variable.py",
+        "control = self.controller.reverse(t, y, system.args, control)",
+        "",
+        tests="test_step_density.py",
+    ),
+    Mutant(
+        "a row of variable steps is found in the step before",
+        "_loop/_variable.py",
+        "found = stops.at[j].set(n), insides.at[j].set(inside)",
+        "found = stops.at[j].set(n - 1), insides.at[j].set(inside)",
+        tests="test_step_density.py",
+    ),
+    Mutant(
+        "stages of collocation by the momenta of the last round",
+        "_scheme/_gauss_solve.py",
+        "velocities = self.velocities(q, p)",
+        "velocities = self.velocities(q, stages[1])",
+        tests="test_collocation.py",
+    ),
+    Mutant(
+        "a restarted iteration keeps slopes that are not finite",
+        "_scheme/_gauss_solve.py",
+        "start((step.stages(nothing), nothing), (stages, slopes))",
+        "start((step.stages(nothing), slopes), (stages, slopes))",
+        tests="test_collocation.py",
+    ),
+    Mutant(
+        "a linear system that is not solved has numbers",
+        "_implicit.py",
+        "return tree.invalid_if(found.result != lx.RESULTS.successful, found.value)",
+        "return found.value",
+        tests="test_constrained.py",
+    ),
+    Mutant(
         "what all steps share is not differentiated",
         "_loop/_problem.py",
-        "data = prepared(False)",
-        "data = lax.stop_gradient(prepared(False))",
+        "data = steps.prepare(scheme, system, backward=False)",
+        "data = lax.stop_gradient(steps.prepare(scheme, system, backward=False))",
         ("constant", "reversal"),
     ),
     Mutant(
@@ -327,7 +370,7 @@ MUTANTS = [
     ),
     Mutant(
         "gaps in the saved times have values",
-        "_loop/_steps.py",
+        "_loop/_rows.py",
         "return self.reached(n) & (self.stop >= 0)",
         "return self.reached(n)",
         tests="test_steps.py",
@@ -335,7 +378,7 @@ MUTANTS = [
     Mutant(
         "steps go on after a failure",
         "_loop/_run.py",
-        "return some & tree.all_finite(progress.point[0])",
+        "return some & tree.all_finite(point[0])",
         "return some",
         tests="test_steps.py",
     ),

@@ -114,6 +114,37 @@ def test_motion_comes_to_rest_far_from_the_origin(stages, dtype):
     assert np.all(end(number([0.0, 0.3, 1.0, 1e3, 1e6])))
 
 
+def links(n):
+    """A chain of hanging links of unit length and weight, and angles of its start."""
+    below = np.arange(n, 0, -1) / n
+    mass = lambda t, q, args: (
+        np.minimum.outer(below, below) * jnp.cos(q[:, None] - q[None])
+    )
+    potential = lambda t, q, args: -jnp.sum(below * jnp.cos(q))
+    system = dps.LagrangianSystem(mass, potential, dps.ConstantDamping(0.05))
+    return system, (jnp.linspace(0.8, 0.5, n), jnp.zeros(n))
+
+
+# A mass of six positions is factorised once in a round, that of two for each velocity.
+@pytest.mark.parametrize("n", [2, 6])
+def test_momenta_first_takes_half_of_the_iterations(n):
+    system, y0 = links(n)
+    solver = dps.PresymplecticGauss(4, tolerance=1e-7, max_iterations=6)
+    sol = solve(system, solver, 0.0, 40.0, 0.4, y0, throw=False)
+    assert is_successful(sol)
+
+
+def test_a_guess_that_diverges_is_dropped():
+    system, y0 = links(6)
+    solver = dps.PresymplecticGauss(8)
+    solve_by = lambda dt0: solve(system, solver, 0.0, 40.0, dt0, y0, throw=False)
+    # The extrapolated slopes of one of the long steps are out of all bounds.
+    sol, exact = solve_by(0.625), solve_by(0.25)
+    assert is_successful(sol) and is_successful(exact)
+    for x, y in zip(sol.ys, exact.ys, strict=True):
+        np.testing.assert_allclose(x, y, atol=1e-5)
+
+
 @pytest.mark.parametrize("frequency", [1.0, 3.0, 30.0])
 def test_gradient_at_an_equilibrium(frequency):
     """The step converges at once, whatever its length; its derivatives may not."""
