@@ -1,7 +1,7 @@
 """Render formulas by KaTeX when a page is built, so that a reader needs no script.
 
-Arithmatex marks the formulas in pages and docstrings. KaTeX 0.19.1 and its fonts, from npm, are in
-`docs/_static/katex`. A formula that KaTeX does not understand fails the build.
+Arithmatex marks the formulas in pages and docstrings. KaTeX 0.19.1 and its fonts, from
+npm, are in `docs/_static/katex`. A formula that KaTeX cannot read fails the build.
 """
 
 import functools
@@ -35,10 +35,15 @@ def on_page_content(content, page, **kwargs):
             formula = katex().call("katex.renderToString", latex, options)
         except JSEvalException as e:
             raise PluginError(f"{page.file.src_uri}: ${latex}$: {e}") from e
-        # The search index takes the letters alone, without a second copy and the source.
+        # The search index takes the letters alone, without a copy and the source.
         formula = formula.replace(
             '"katex-mathml"', '"katex-mathml" data-search-exclude="true"'
         )
         return f"{match['open']}{formula}</"
 
     return FORMULA.sub(render, content)
+
+
+# Python would wait for an engine that is open.
+def on_shutdown(**kwargs):
+    katex().close()
