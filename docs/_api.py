@@ -1,9 +1,10 @@
-"""Let the search find a public name, and check that it does.
+"""Link the public names in docstrings, and let the search find them.
 
-The separator in `mkdocs.yml` splits names into words, so headings of other pages have
-the same words. This MkDocs hook gives the entries of the API a higher weight, the fewer
-words the higher. After a build it searches for each name, by the code that runs in a
-browser, and fails unless its entry is the first result.
+Docstrings have no links, as `help()` shows them as they are written. The separator in
+`mkdocs.yml` splits names into words, so headings of other pages have the same words.
+This MkDocs hook gives the entries of the API a higher weight, the fewer words the
+higher. After a build it searches for each name, by the code that runs in a browser, and
+fails unless its entry is the first result.
 """
 
 import json
@@ -13,8 +14,17 @@ import re
 from mkdocs.exceptions import PluginError
 from py_mini_racer import MiniRacer
 
+from diffrax_presym import __version__
 
-API = pathlib.Path(__file__).parent / "api"
+
+PAGES = sorted((pathlib.Path(__file__).parent / "api").glob("*.md"))
+NAMES = re.findall(
+    r"^::: diffrax_presym\.([\w.]+)$",
+    "\n".join(x.read_text() for x in PAGES),
+    re.MULTILINE,
+)
+# Code that is a name, or a call of it, and no link yet.
+CODE = re.compile(r'(?<!">)<code>(?P<name>[\w.]+)(?:\([^<]*)?</code>')
 # What a worker of a browser has.
 WORKER = """
 var self = globalThis, console = {warn() {}}, handle, reply;
@@ -22,20 +32,31 @@ var addEventListener = (_, f) => handle = f, postMessage = x => reply = x;
 """
 
 
-def public_names():
-    pages = "\n".join(x.read_text() for x in API.glob("*.md"))
-    return re.findall(r"^::: (diffrax_presym\.[\w.]+)$", pages, re.MULTILINE)
+def on_config(config):
+    config.site_name += f" {__version__}"
+    return config
+
+
+def on_page_content(content, page, **kwargs):
+    def link(match):
+        name = match["name"]
+        if name not in NAMES:
+            return match[0]
+        return f'<autoref identifier="diffrax_presym.{name}">{match[0]}</autoref>'
+
+    is_api = page.file.src_uri.startswith("api/")
+    return CODE.sub(link, content) if is_api else content
 
 
 def name_of(location):
-    return location.partition("#")[2]
+    return location.partition("#")[2].removeprefix("diffrax_presym.")
 
 
 def on_page_context(context, page, config, nav):
-    names, search = public_names(), config.plugins["material/search"]
+    search = config.plugins["material/search"]
     for entry in search.search_index.entries:
         name = name_of(entry["location"])
-        if name in names:
+        if name in NAMES:
             words = re.split(search.config.separator, name.rpartition(".")[2])
             entry["boost"] = 10 * 1.1 ** -len(words)
 
@@ -54,9 +75,9 @@ def on_post_build(config):
             return json.loads(engine.eval("JSON.stringify(reply)"))
 
         send(0, index | {"options": {}})
-        for name in public_names():
-            short = name.removeprefix("diffrax_presym.")
-            for query in {name, f"dps.{short}", short, short.rpartition(".")[2]}:
+        for name in NAMES:
+            queries = {f"diffrax_presym.{name}", f"dps.{name}", name}
+            for query in queries | {name.rpartition(".")[2]}:
                 results = send(2, query)["data"]["items"]
                 first = results[0][0]["location"] if results else "none"
                 # Names of the same words, such as `work_precision`, are one.
