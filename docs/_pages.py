@@ -1,4 +1,4 @@
-"""A click on a figure opens it alone, where browsers can enlarge it."""
+"""Figures that a click opens alone, and names that screen readers need."""
 
 import re
 
@@ -9,3 +9,7 @@ FIGURE = re.compile(r'(?<=<p>)<img [^>]*?src="(?P<source>[^"]+)"[^>]*>')
 
 def on_page_content(content, **kwargs):
     return FIGURE.sub(r'<a class="figure" href="\g<source>">\g<0></a>', content)
+
+
+def on_post_page(output, **kwargs):
+    return output.replace('role="dialog"', 'role="dialog" aria-label="Search"')
