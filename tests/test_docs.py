@@ -2,6 +2,7 @@
 
 import inspect
 import pathlib
+import pydoc
 import re
 import runpy
 
@@ -208,3 +209,21 @@ def test_references_resolve():
         for groups in REFERENCE.findall(text):
             name = "".join(groups).removeprefix("diffrax_presym.")
             assert name in PUBLIC, f"{where} refers to {name}"
+
+
+@pytest.mark.variants(1000)
+@pytest.mark.parametrize("name", PUBLIC)
+def test_help_is_readable_in_a_terminal(name):
+    value = PUBLIC[name]
+    assert "Initialize self" not in pydoc.render_doc(value)
+    # What is inherited from Diffrax is written for its own documentation.
+    text, inherited = [], []
+    for base in inspect.getmro(value) if inspect.isclass(value) else [value]:
+        own = base.__module__.startswith("diffrax_presym")
+        members = [base, *vars(base).values()]
+        methods = [x for x in members if x is base or not inspect.isclass(x)]
+        docs = [str(getattr(x, "__doc__", "")) for x in methods]
+        (text if own else inherited).extend(docs)
+    text = "\n".join(set(text) - set(inherited))
+    text = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    assert not re.search(r"\]\[|\$|\\[a-zA-Z]|<\w+>", text)

@@ -26,7 +26,7 @@ class Mechanics(NamedTuple):
 
     **Attributes:**
 
-    - `mass`: as in [`diffrax_presym.QuadraticKinetic`][]; `None` is one.
+    - `mass`: as in `QuadraticKinetic`; `None` is one.
     - `has_mass`: whether the mass is known.
     - `mass_varies`: whether it depends on positions or momenta, as the mass of joints
         or of relativistic particles: no drift is exact.
@@ -87,3 +87,6 @@ class AbstractFriction(eqx.Module):
     @abc.abstractmethod
     def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
         """The force of the friction on momenta `p` and velocities `v`."""
+
+
+AbstractFriction.__init__.__doc__ = "**Arguments:** its fields, if any."

@@ -27,13 +27,13 @@ Numbers = PyTree[Inexact[Array, "..."]]
 
 
 class Damping(AbstractFriction):
-    r"""Friction $p' = F - \eta'(t) \, p$ at a rate, in units of one over time.
+    """Friction `p' = F - η'(t) p` at a rate, in units of one over time.
 
-    Made by [`diffrax_presym.ConstantDamping`][], [`diffrax_presym.LogDamping`][] and
-    [`diffrax_presym.PowerDamping`][]. Positive rates damp, negative rates excite. The
-    log scale $\eta$ is a sum of functions of time, each with a factor: one number for
-    friction alike on all momenta; or an array with as many dimensions as `p` that
-    broadcasts to it, or a pytree of these, with a rate for each degree of freedom.
+    Made by `ConstantDamping`, `LogDamping` and `PowerDamping`. Positive rates damp,
+    negative rates excite. The log scale `η` is a sum of functions of time, each with a
+    factor: one number for friction alike on all momenta; or an array with as many
+    dimensions as `p` that broadcasts to it, or a pytree of these, with a rate for each
+    degree of freedom.
     """
 
     terms: tuple[tuple[AbstractLogScale, Any], ...]
@@ -52,15 +52,15 @@ class Damping(AbstractFriction):
         return functools.reduce(tree.sum, [term(*x) for x in self.terms])
 
     def __call__(self, t: Time) -> Numbers:
-        r"""The log scale $\eta(t)$."""
+        """The log scale `η(t)`."""
         return self._sum(lambda law: law(t))
 
     def increment(self, t: Time, h: Time) -> Numbers:
-        r"""The difference $\eta(t + h) - \eta(t)$, without cancellation."""
+        """The difference `η(t + h) - η(t)`, without cancellation."""
         return self._sum(lambda law: law.increment(t, h))
 
     def rate(self, t: Time) -> Numbers:
-        r"""The rate $\eta'(t)$."""
+        """The rate `η'(t)`."""
         return self._sum(lambda law: law.rate(as_time(t)))
 
 
@@ -80,19 +80,18 @@ def as_numbers(x, name: str) -> Numbers:
 
 
 def ConstantDamping(gamma) -> Damping:
-    r"""Friction $-\gamma \, p$ at a constant rate $\gamma$, in units of one over time.
+    """Friction `-γ p` at a constant rate `γ`, in units of one over time.
 
-    The log scale is $\eta(t) = \gamma t$: the heavy-ball method and the damped
-    oscillator, equation (eta1_large) of França, Jordan and Vidal (2021). For friction
-    by a coefficient, in units of force per velocity, write
-    [`diffrax_presym.ViscousDamping`][].
+    The log scale is `η(t) = γ t`: the heavy-ball method and the damped oscillator,
+    equation (eta1_large) of França, Jordan and Vidal (2021). For friction by a
+    coefficient, in units of force per velocity, write `ViscousDamping`.
 
     **Arguments:**
 
     - `gamma`: the rate of damping, in units of one over time. Real, of any sign;
-        negative excites. A number, or for [`diffrax_presym.MechanicalSystem`][] a rate
-        for each degree of freedom: an array with as many dimensions as `p` that
-        broadcasts to it, or a pytree of these.
+        negative excites. A number, or for `MechanicalSystem` a rate for each degree of
+        freedom: an array with as many dimensions as `p` that broadcasts to it, or a
+        pytree of these.
 
     **Raises:**
 
@@ -103,23 +102,23 @@ def ConstantDamping(gamma) -> Damping:
 
 
 def LogDamping(gamma, shift: ArrayLike | None = None) -> Damping:
-    r"""Friction that decays with time, $-\gamma \, p / (t + s)$.
+    """Friction that decays with time, `-γ p / (t + s)`.
 
-    The log scale is $\eta(t) = \gamma \log(t + s)$. With $\gamma = 3$ and no shift this
-    is the ODE of Nesterov's method, equation (eta1_small) of França, Jordan and Vidal
-    (2021); with $s = 1$ their decaying oscillator.
+    The log scale is `η(t) = γ log(t + s)`. With `γ = 3` and no shift this is the ODE of
+    Nesterov's method, equation (eta1_small) of França, Jordan and Vidal (2021); with
+    `s = 1` their decaying oscillator.
 
-    The rate is infinite at $t = -s$. With positive damping a solve may start there,
+    The rate is infinite at `t = -s`. With positive damping a solve may start there,
     from zero momentum; there splittings with a quadratic kinetic energy have at most
-    order $\gamma + 1$, and other schemes order 2. Schemes whose stages extend beyond
-    the step, such as [`diffrax_presym.SuzukiYoshida`][], must start far enough
-    from there; otherwise the solve fails.
+    order `γ + 1`, and other schemes order 2. Schemes whose stages extend beyond the
+    step, such as `SuzukiYoshida`, must start far enough from there; otherwise the solve
+    fails.
 
     **Arguments:**
 
     - `gamma`: the strength of the damping, dimensionless, of any sign. A number, array
-        or pytree as for [`diffrax_presym.ConstantDamping`][].
-    - `shift`: the shift $s$ of time, in units of time: a number. Defaults to none.
+        or pytree as for `ConstantDamping`.
+    - `shift`: the shift `s` of time, in units of time: a number. Defaults to none.
     """
     if shift is not None:
         shift = as_finite(shift, "`LogDamping(shift=...)`")
@@ -128,19 +127,19 @@ def LogDamping(gamma, shift: ArrayLike | None = None) -> Damping:
 
 
 def PowerDamping(gamma, delta) -> Damping:
-    r"""Friction that varies like a power of time, $-\gamma \delta t^{\delta - 1} \, p$.
+    """Friction that varies like a power of time, `-γ δ t^(δ - 1) p`.
 
-    The log scale is $\eta(t) = \gamma t^\delta$. With an exponent between 0 and 1, and
-    together with [`diffrax_presym.LogDamping`][], it is between that and
-    [`diffrax_presym.ConstantDamping`][]: equation (damp_between) of França, Jordan and
-    Vidal (2021) is `friction=[LogDamping(gamma1), PowerDamping(gamma2, delta)]`. Time
-    must not be negative; from $t = 0$, where the rate is infinite for an exponent below
-    1, a solve may start from zero momentum, with order 2.
+    The log scale is `η(t) = γ t^δ`. With an exponent between 0 and 1, and together with
+    `LogDamping`, it is between that and `ConstantDamping`: equation (damp_between) of
+    França, Jordan and Vidal (2021) is `friction=[LogDamping(gamma1),
+    PowerDamping(gamma2, delta)]`. Time must not be negative; from `t = 0`, where the
+    rate is infinite for an exponent below 1, a solve may start from zero momentum, with
+    order 2.
 
     **Arguments:**
 
-    - `gamma`: the strength, in units of time to the power $-\delta$. A number, array or
-        pytree as for [`diffrax_presym.ConstantDamping`][].
+    - `gamma`: the strength, in units of time to the power `-δ`. A number, array or
+        pytree as for `ConstantDamping`.
     - `delta`: the exponent, a number.
     """
     delta = as_finite(delta, "`PowerDamping(..., delta)`")

@@ -23,19 +23,17 @@ _FOR_BODIES = (
 
 
 class Drag(AbstractFriction):
-    r"""Drag $-c \, |v| \, v$ of each body by the square of its speed $|v|$: of air and
-    water. (Stokes drag, by the speed, is [`diffrax_presym.ViscousDamping`][].)
+    """Drag `-c |v| v` of each body by the square of its speed `|v|`: of air and water.
+    (Stokes drag, by the speed, is `ViscousDamping`.)
 
-    For [`diffrax_presym.MechanicalSystem`][], with
-    [`diffrax_presym.QuadraticKinetic`][] and one mass for each body. Bodies are the
-    vectors over the last axis of `p`. Drag is part of the kicks: a symmetric
+    For `MechanicalSystem`, with `QuadraticKinetic` and one mass for each body. Bodies
+    are the vectors over the last axis of `p`. Drag is part of the kicks: a symmetric
     composition, of the order of the scheme, of the force and of drag alone, which keeps
-    the direction and has a closed form. The force is evaluated once per kick.
-    [`diffrax_presym.Strang`][], [`diffrax_presym.BlanesMoan4`][] and
-    [`diffrax_presym.BlanesMoan6`][] keep their order;
-    Runge--Kutta--Nyström splittings would not, and refuse it. No structure is kept but
-    the symmetry. In a wind or a current, give the velocity $w$ of the `medium`: the
-    drag is then $-c \, |v - w| \, (v - w)$.
+    the direction and has a closed form. The force is evaluated once per kick. `Strang`,
+    `BlanesMoan4` and `BlanesMoan6` keep their order; Runge--Kutta--Nyström splittings
+    would not, and refuse it. No structure is kept but the symmetry. In a wind or a
+    current, give the velocity `w` of the `medium`: the drag is then
+    `-c |v - w| (v - w)`.
 
     Schemes of order above 2 have stages backwards in time, during which drag
     accelerates. A solve fails if the momentum that a body loses over such a stage
@@ -46,14 +44,13 @@ class Drag(AbstractFriction):
     medium: Numbers | Callable | None
 
     def __init__(self, coefficient, medium=None):
-        r"""**Arguments:**
+        """**Arguments:**
 
-        - `coefficient`: $c$, in units of force per velocity squared: a number; an array
+        - `coefficient`: `c`, in units of force per velocity squared: a number; an array
             with as many dimensions as `p` and a last axis of length 1, one for each
-            body; a pytree of the structure of `p` of these; or a function
-            `c(t, q, args)` that returns one of these. Of any sign; negative
-            accelerates.
-        - `medium`: the velocity $w$ of the medium: an array that broadcasts to `p`, a
+            body; a pytree of the structure of `p` of these; or a function `c(t, q,
+            args)` that returns one of these. Of any sign; negative accelerates.
+        - `medium`: the velocity `w` of the medium: an array that broadcasts to `p`, a
             pytree of the structure of `p` of these, or a function `w(t, q, args)` that
             returns one of these. Defaults to `None`, at rest.
 

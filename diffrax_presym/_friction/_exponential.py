@@ -78,8 +78,8 @@ _SQUARINGS = 16
 def exponentials(
     matrix: Inexact[Array, "*batch n n"], times: Inexact[Array, " times"]
 ) -> tuple[Inexact[Array, "times *batch n n"], Inexact[Array, "times *batch n n"]]:
-    r"""For each time $x$ the change $e^{-x G} - 1$, and the integral of $e^{-s G}$ over
-    $s$ from 0 to $x$.
+    """For each time `x` the change `exp(-x G) - 1`, and the integral of `exp(-s G)`
+    over `s` from 0 to `x`.
 
     By scaling and squaring, with powers of the matrix that all times share. The change
     is computed without cancellation. Both are NaN if the matrix times the longest time

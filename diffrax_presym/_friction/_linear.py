@@ -21,7 +21,7 @@ class Effects(eqx.Module):
 
 
 class LinearFriction(eqx.Module):
-    r"""Linear friction $p' = F - \Gamma(t) \, p$ of momenta of one structure.
+    """Linear friction `p' = F - Γ(t) p` of momenta of one structure.
 
     `prepare` gives what depends on time alone, for a span; the other methods apply it.
     Changes rather than new momenta are returned, for compensated summation.
@@ -101,7 +101,7 @@ class LinearFriction(eqx.Module):
         return self._map("respond", effects.leaves, force)
 
     def net_force(self, t: Time, force: PyTree, p: PyTree) -> PyTree:
-        r"""The force less the friction, $F - \Gamma(t) \, p$."""
+        """The force less the friction, `F - Γ(t) p`."""
         net = lambda leaf, force, p: leaf.net_force(t, force, p)
         return jtu.tree_map(net, self.leaves, force, p, is_leaf=_is_leaf)
 

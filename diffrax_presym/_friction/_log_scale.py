@@ -32,7 +32,7 @@ class Effect(NamedTuple):
 
 
 class AbstractLogScale(eqx.Module):
-    r"""A function $\eta(t)$, the integral of a rate of friction.
+    """A function `η(t)`, the integral of a rate of friction.
 
     Subclass it for a rate whose differences are known without cancellation, and pass an
     instance as `friction=`; a function `eta(t)` is enough otherwise.
@@ -45,18 +45,18 @@ class AbstractLogScale(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, t: Time) -> Inexact[Array, "..."]:
-        r"""The log scale $\eta(t)$."""
+        """The log scale `η(t)`."""
 
     @abc.abstractmethod
     def increment(self, t: Time, h: Time) -> Inexact[Array, "..."]:
-        r"""The difference $\eta(t + h) - \eta(t)$.
+        """The difference `η(t + h) - η(t)`.
 
         Subtracting two values loses most digits at late times in `float32`.
         """
 
     @abc.abstractmethod
     def rate(self, t: Time) -> Inexact[Array, "..."]:
-        r"""The rate $\eta'(t)$."""
+        """The rate `η'(t)`."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -72,6 +72,9 @@ class AbstractLogScale(eqx.Module):
     def is_singular(self, t: Time) -> Bool[Array, ""] | None:
         """Whether the rate is infinite at `t`; `None` if it never is."""
         return None
+
+
+AbstractLogScale.__init__.__doc__ = "**Arguments:** its fields, if any."
 
 
 Terms = Sequence[tuple[AbstractLogScale, Array]]
@@ -94,7 +97,7 @@ def by_quadrature(terms: Terms, t: Time, h: Time, order: int) -> Effect:
 
 
 class Linear(AbstractLogScale):
-    r"""$\eta(t) = t$."""
+    """`η(t) = t`."""
 
     is_autonomous: ClassVar[bool] = True
     shape: ClassVar[tuple[int, ...]] = ()  # known without tracing
@@ -120,7 +123,7 @@ _ALL_LOST = 40.0
 
 
 class Logarithm(AbstractLogScale):
-    r"""$\eta(t) = \log(t + s)$."""
+    """`η(t) = log(t + s)`."""
 
     shift: Inexact[ArrayLike, "..."] | None
     strength: ClassVar[float] = 1.0
@@ -163,7 +166,7 @@ class Logarithm(AbstractLogScale):
 
 
 class Power(AbstractLogScale):
-    r"""$\eta(t) = t^\delta$."""
+    """`η(t) = t^δ`."""
 
     delta: Inexact[ArrayLike, "..."]
     is_autonomous: ClassVar[bool] = False

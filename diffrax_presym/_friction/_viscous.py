@@ -84,32 +84,29 @@ class LocalFriction(AbstractFriction):
 
 
 def ViscousDamping(coefficients) -> ViscousFriction | LocalFriction:
-    r"""Friction $-C v$ by a coefficient $C$, in units of force per velocity: dashpots,
+    """Friction `-C v` by a coefficient `C`, in units of force per velocity: dashpots,
     viscous drag, magnetic fields, Coriolis forces.
 
-    For friction at a rate, in units of one over time, write
-    [`diffrax_presym.ConstantDamping`][]. For [`diffrax_presym.MechanicalSystem`][] and
-    [`diffrax_presym.LagrangianSystem`][]. In the first, with
-    [`diffrax_presym.QuadraticKinetic`][], the flow of drift and friction is exact, by
-    $e^{-h C M^{-1}}$ and its integral, so that no scheme loses its order by it. A
-    symmetric positive matrix $C$ damps; an antisymmetric one does no work, and the
-    energy is kept: the force $e \, v \times B$ on a charge $e$ in a uniform magnetic
-    field $B$, and the Coriolis force $-2 m \, \Omega \times v$ in a frame that rotates
-    with $\Omega$.
+    For friction at a rate, in units of one over time, write `ConstantDamping`. For
+    `MechanicalSystem` and `LagrangianSystem`. In the first, with `QuadraticKinetic`,
+    the flow of drift and friction is exact, by `exp(-h C M^-1)` and its integral, so
+    that no scheme loses its order by it. A symmetric positive matrix `C` damps; an
+    antisymmetric one does no work, and the energy is kept: the force `e v × B` on a
+    charge `e` in a uniform magnetic field `B`, and the Coriolis force `-2 m Ω × v` in a
+    frame that rotates with `Ω`.
 
-    With numbers or arrays the cost is that of
-    [`diffrax_presym.ConstantDamping`][]. With matrices and equal steps, in the loop of
-    [`diffrax_presym.FixedStepAdjoint`][], exponentials for all stages are computed once
-    for a solve, and a drift is two products with a matrix. Elsewhere a drift takes
-    about fifteen products, more under strong friction.
+    With numbers or arrays the cost is that of `ConstantDamping`. With matrices and
+    equal steps, in the loop of `FixedStepAdjoint`, exponentials for all stages are
+    computed once for a solve, and a drift is two products with a matrix. Elsewhere a
+    drift takes about fifteen products, more under strong friction.
 
-    Rayleigh damping, $C = \alpha M + \beta K$, is a list of two laws:
-    `[ConstantDamping(alpha), ViscousDamping(beta * K)]`.
+    Rayleigh damping, `C = α M + β K`, is a list of two laws: `[ConstantDamping(alpha),
+    ViscousDamping(beta * K)]`.
 
-    If $C$ depends on time or place, by a function, the friction is part of the kicks,
-    and exact there at fixed positions: as [`diffrax_presym.PositionDamping`][]. With
-    any other kinetic energy a kick solves an equation for the momentum, as for a
-    `force=f`: use [`diffrax_presym.BlanesMoan4`][] or [`diffrax_presym.BlanesMoan6`][].
+    If `C` depends on time or place, by a function, the friction is part of the kicks,
+    and exact there at fixed positions: as `PositionDamping`. With any other kinetic
+    energy a kick solves an equation for the momentum, as for a `force=f`: use
+    `BlanesMoan4` or `BlanesMoan6`.
 
     !!! example
 
@@ -125,8 +122,8 @@ def ViscousDamping(coefficients) -> ViscousFriction | LocalFriction:
 
     **Arguments:**
 
-    - `coefficients`: $C$, in units of force per velocity (torque per angular
-        velocity for an angle), of any sign, in any of these forms.
+    - `coefficients`: `C`, in units of force per velocity (torque per angular velocity
+        for an angle), of any sign, in any of these forms.
         - A number: the same for every degree of freedom.
         - An array with as many dimensions as `p`, and broadcastable to it: a
             coefficient for each degree of freedom.
@@ -156,27 +153,25 @@ def ViscousDamping(coefficients) -> ViscousFriction | LocalFriction:
 
 
 def PositionDamping(rate: Callable) -> LocalFriction:
-    r"""Friction $-\Gamma(t, q) \, p$ at a rate that depends on place: absorbing layers,
-    media, contact with a fluid.
+    """Friction `-Γ(t, q) p` at a rate that depends on place: absorbing layers, media,
+    contact with a fluid.
 
-    For [`diffrax_presym.MechanicalSystem`][]. The friction is part of the kicks, which
-    are exact at fixed positions: $p$ to $e^{-h \Gamma} p$ plus the momentum gained.
-    [`diffrax_presym.Strang`][], [`diffrax_presym.BlanesMoan4`][] and
-    [`diffrax_presym.BlanesMoan6`][] keep their order, and contract phase volume by the
-    friction at the kicks. Runge--Kutta--Nyström splittings such as
-    [`diffrax_presym.TunedRKN6`][] would not, and refuse it.
+    For `MechanicalSystem`. The friction is part of the kicks, which are exact at fixed
+    positions: `p` to `exp(-h Γ) p` plus the momentum gained. `Strang`, `BlanesMoan4`
+    and `BlanesMoan6` keep their order, and contract phase volume by the friction at the
+    kicks. Runge--Kutta--Nyström splittings such as `TunedRKN6` would not, and refuse
+    it.
 
     The function is evaluated once per kick. A matrix is exponentiated in every kick.
-    For friction per velocity write [`diffrax_presym.ViscousDamping`][] with a function.
-    Where the rate does not depend on place [`diffrax_presym.ConstantDamping`][] is more
-    efficient.
+    For friction per velocity write `ViscousDamping` with a function. Where the rate
+    does not depend on place `ConstantDamping` is more efficient.
 
     **Arguments:**
 
-    - `rate`: the rate $\Gamma$, in units of one over time, a function
-        `rate(t, q, args)` that returns a number; an array with as many dimensions
-        as `p` that broadcasts to it, a rate for each degree of freedom; a square
-        matrix, with `p` a vector; or a pytree of the structure of `p` of these.
+    - `rate`: the rate `Γ`, in units of one over time, a function `rate(t, q, args)`
+        that returns a number; an array with as many dimensions as `p` that broadcasts
+        to it, a rate for each degree of freedom; a square matrix, with `p` a vector; or
+        a pytree of the structure of `p` of these.
 
     **Raises:**
 

@@ -23,25 +23,23 @@ from ._variable import VariableSteps
 
 
 class FixedStepAdjoint(dfx.AbstractAdjoint):
-    r"""The loop for steps that are known beforehand or reversible, and exact gradients
+    """The loop for steps that are known beforehand or reversible, and exact gradients
     in it: the recommended way to solve, with or without gradients.
 
     Between steps the solution is a Hermite interpolation of degree 11 from four ends of
     steps, which takes no step of the scheme. Where that cannot follow the motion, it is
-    a shorter step: of schemes up to order two, of [`diffrax_presym.TunedLinear8`][], of
-    systems with constraints or on manifolds, in spans of fewer than three steps, where
-    neighbouring steps of `diffrax.StepTo` differ by more than a factor of two, where
-    friction over a step is more than 0.5, and with
-    [`diffrax_presym.StepDensityController`][]. The statistics say which,
+    a shorter step: of schemes up to order two, of `TunedLinear8`, of systems with
+    constraints or on manifolds, in spans of fewer than three steps, where neighbouring
+    steps of `diffrax.StepTo` differ by more than a factor of two, where friction over a
+    step is more than 0.5, and with `StepDensityController`. The statistics say which,
     `sol.stats["interpolated"]`. A solve whose final or saved states are not finite
     fails; of an explicit scheme it ends at the next saved time or end of a step that is
     used for one, as other steps are not checked. For a time of `SaveAt(ts=...)` that is
     NaN, a gap in measured times, nothing is saved: the row stays infinite, as do rows
     after the end of a solve.
 
-    For every solver of this package, with `diffrax.ConstantStepSize`,
-    [`diffrax_presym.StepsBetween`][], `diffrax.StepTo` or
-    [`diffrax_presym.StepDensityController`][], and any `SaveAt` but dense output, and
+    For every solver of this package, with `diffrax.ConstantStepSize`, `StepsBetween`,
+    `diffrax.StepTo` or `StepDensityController`, and any `SaveAt` but dense output, and
     with variable steps `steps=`. With a constant step the steps are all equal: as few
     as are not longer than `dt0`. (Diffrax takes the first of the length `dt0`, if that
     does not divide the time of the solve; and its times may differ in the last bit.)
@@ -53,16 +51,16 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     these or of `SaveAt(fn=...)` closes over; derivatives with respect to times are
     errors. By default the scheme is run backwards: memory does not depend on the number
     of steps, and a gradient costs two to five solves. Damping loses information:
-    backwards in time rounding errors grow by $e^{\eta(t_1) - \eta(t_0)}$. So states are
-    kept along the way, more with more damping, from which the backward pass restarts: a
-    kept state is the start of its step, and with as many as steps none is recomputed.
-    The error of the recomputed states is measured. Where it is beyond `tol` the
-    gradient is NaN, of that member of a batch alone; outside of a batch that is an
-    error, unless the solve has `throw=False`. By `gradient="checkpoints"`, and for
-    schemes without an inverse, the steps between kept states are computed again
-    instead; the memory then grows with the square root of the number of steps. For
-    second derivatives use forward mode over reverse mode, `jax.jvp` of `jax.grad`; for
-    forward mode alone `diffrax.ForwardMode()`.
+    backwards in time rounding errors grow by `exp(η(t1) - η(t0))`. So states are kept
+    along the way, more with more damping, from which the backward pass restarts: a kept
+    state is the start of its step, and with as many as steps none is recomputed. The
+    error of the recomputed states is measured. Where it is beyond `tol` the gradient is
+    NaN, of that member of a batch alone; outside of a batch that is an error, unless
+    the solve has `throw=False`. By `gradient="checkpoints"`, and for schemes without an
+    inverse, the steps between kept states are computed again instead; the memory then
+    grows with the square root of the number of steps. For second derivatives use
+    forward mode over reverse mode, `jax.jvp` of `jax.grad`; for forward mode alone
+    `diffrax.ForwardMode()`.
     """
 
     gradient: Literal["reversal", "checkpoints"] | None = None
@@ -151,7 +149,7 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         return Checkpoints(max_steps, number)
 
 
-FixedStepAdjoint.__init__.__doc__ = r"""**Arguments:**
+FixedStepAdjoint.__init__.__doc__ = """**Arguments:**
 
 - `gradient`: `"reversal"`, by running the scheme backwards, or `"checkpoints"`, by
     computing steps again. Defaults to `None`: by reversal if the scheme has an inverse.

@@ -55,13 +55,12 @@ class Scheme(NamedTuple):
 
 
 class AbstractPresymplecticSolver(dfx.AbstractSolver):
-    """A scheme for a system such as [`diffrax_presym.MechanicalSystem`][].
+    """A scheme for a system such as `MechanicalSystem`.
 
     A scheme defines its moves; `diffrax.diffeqsolve` handles saving, events, adjoints
-    and the direction of time. No scheme has an error estimate:
-    [`diffrax_presym.choose_step`][] finds the step for a tolerance. For adaptive steps,
-    wrap the scheme in `diffrax.HalfSolver`. A step whose end is not finite makes the
-    solve fail.
+    and the direction of time. No scheme has an error estimate: `choose_step` finds the
+    step for a tolerance. For adaptive steps, wrap the scheme in `diffrax.HalfSolver`. A
+    step whose end is not finite makes the solve fail.
     """
 
     # Not `AbstractSystem`, so that other terms reach the error message of `bind`.
@@ -114,6 +113,9 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver):
 
     def func(self, terms, t0, y0, args):
         return terms.vf(t0, y0, args)
+
+
+AbstractPresymplecticSolver.__init__.__doc__ = "**Arguments:** its fields, if any."
 
 
 def advance(

@@ -10,11 +10,11 @@ MAX_STAGES = 8
 
 
 class GaussTable(NamedTuple):
-    r"""Gauss collocation on $[0, 1]$; see section II.1.3 of Hairer, Lubich, Wanner.
+    """Gauss collocation on `[0, 1]`; see section II.1.3 of Hairer, Lubich, Wanner.
 
-    Polynomials are written in the Legendre polynomials $P_k$ shifted to $[0, 1]$. With
+    Polynomials are written in the Legendre polynomials `P_k` shifted to `[0, 1]`. With
     the discrete orthogonality of these at the nodes, the Lagrange polynomials are
-    $\ell_j(x) = b_j \sum_k (2k + 1) P_k(c_j) P_k(x)$.
+    `l_j(x) = b_j Σ_k (2k + 1) P_k(c_j) P_k(x)`.
     """
 
     nodes: np.ndarray  # c

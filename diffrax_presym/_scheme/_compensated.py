@@ -24,8 +24,8 @@ class Compensated(AbstractPresymplecticSolver):
 
     ??? cite "Reference"
 
-        Section VIII.5 of Hairer, Lubich and Wanner (2006), see
-        [`diffrax_presym.PresymplecticGauss`][], after
+        Section VIII.5 of Hairer, Lubich and Wanner (2006), see `PresymplecticGauss`,
+        after
 
         ```bibtex
         @article{moller1965quasi,

@@ -34,7 +34,7 @@ class Composition(AbstractPresymplecticSolver):
         """**Arguments:**
 
         - `base`: a presymplectic solver, symmetric unless all weights are equal; for
-            example [`diffrax_presym.PresymplecticLeapfrog`][].
+            example `PresymplecticLeapfrog`.
         - `weights`: the lengths of the stages in units of the step: real numbers of any
             sign that sum to one.
         - `order`: the order of the composition, which is not computed from the weights.
@@ -96,24 +96,23 @@ def _leapfrog_if_none(base) -> AbstractPresymplecticSolver:
 def SuzukiYoshida(
     order: int, base: AbstractPresymplecticSolver | None = None
 ) -> Composition:
-    r"""The triple jump of Suzuki and Yoshida, to any even order.
+    """The triple jump of Suzuki and Yoshida, to any even order.
 
-    Order as given; $3^{r/2 - 1}$ force evaluations per step at order $r$. Symmetric.
+    Order as given; `3^(r/2 - 1)` force evaluations per step at order `r`. Symmetric.
     Uses Hermite interpolation for dense/ts output, in Diffrax's own loop at the cost of
     up to seven more steps.
 
     The scheme of the paper. Its error constants are large, and its stages extend beyond
     both ends of the step, by up to 0.35, 0.65 and 0.92 of its length at orders 4, 6 and
-    8. The system must be defined there: [`diffrax_presym.LogDamping`][] is not close to
-    its singularity.
+    8. The system must be defined there: `LogDamping` is not close to its singularity.
 
     **Arguments:**
 
     - `order`: the order, a positive even number. At 2 it is the base itself.
     - `base`: a symmetric presymplectic solver of second order. Defaults to
-        [`diffrax_presym.PresymplecticLeapfrog`][].
+        `PresymplecticLeapfrog`.
 
-    **Returns:** a [`diffrax_presym.Composition`][].
+    **Returns:** a `Composition`.
 
     **Raises:**
 
@@ -149,21 +148,20 @@ def SuzukiYoshida(
 def PresymplecticYoshida4(
     base: AbstractPresymplecticSolver | None = None,
 ) -> Composition:
-    """Yoshida's fourth-order scheme, [`diffrax_presym.SuzukiYoshida`][]`(4, base)`.
+    """Yoshida's fourth-order scheme, `SuzukiYoshida(4, base)`.
 
     4th order and symmetric. Three force evaluations per step. Uses Hermite
     interpolation for dense/ts output, in Diffrax's own loop at the cost of another
     step.
 
-    [`diffrax_presym.BlanesMoanRKN4`][] has errors some three hundred times smaller at
-    equal cost.
+    `BlanesMoanRKN4` has errors some three hundred times smaller at equal cost.
 
     **Arguments:**
 
     - `base`: a symmetric presymplectic solver of second order. Defaults to
-        [`diffrax_presym.PresymplecticLeapfrog`][].
+        `PresymplecticLeapfrog`.
 
-    **Returns:** a [`diffrax_presym.Composition`][].
+    **Returns:** a `Composition`.
 
     **Raises:**
 
@@ -179,18 +177,17 @@ def Suzuki4(base: AbstractPresymplecticSolver | None = None) -> Composition:
     Uses Hermite interpolation for dense/ts output, in Diffrax's own loop at the cost of
     another step.
 
-    Its error is several times smaller than that of the triple jump
-    ([`diffrax_presym.SuzukiYoshida`][]) at equal cost, and its stages stay
-    within the step.
+    Its error is several times smaller than that of the triple jump (`SuzukiYoshida`) at
+    equal cost, and its stages stay within the step.
 
-    Source: Suzuki (1990), see [`diffrax_presym.SuzukiYoshida`][].
+    Source: Suzuki (1990), see `SuzukiYoshida`.
 
     **Arguments:**
 
     - `base`: a symmetric presymplectic solver of second order. Defaults to
-        [`diffrax_presym.PresymplecticLeapfrog`][].
+        `PresymplecticLeapfrog`.
 
-    **Returns:** a [`diffrax_presym.Composition`][].
+    **Returns:** a `Composition`.
 
     **Raises:**
 
@@ -209,15 +206,15 @@ def SofroniouSpaletta(
     own loop at the cost of three more steps.
 
     The recommended compositions of high order, for any base. If the kinetic part has a
-    known flow, a [`diffrax_presym.Splitting`][] is more accurate at equal cost.
+    known flow, a `Splitting` is more accurate at equal cost.
 
     **Arguments:**
 
     - `order`: 6, 8 or 10. Defaults to 6. Order 10 is for errors close to rounding.
     - `base`: a symmetric presymplectic solver of second order. Defaults to
-        [`diffrax_presym.PresymplecticLeapfrog`][].
+        `PresymplecticLeapfrog`.
 
-    **Returns:** a [`diffrax_presym.Composition`][].
+    **Returns:** a `Composition`.
 
     **Raises:**
 

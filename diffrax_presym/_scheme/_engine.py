@@ -82,6 +82,9 @@ class AbstractMove(eqx.Module):
         return type(self).prepare is AbstractMove.prepare
 
 
+AbstractMove.__init__.__doc__ = "**Arguments:** its fields, if any."
+
+
 class Inverse(AbstractMove):
     """The inverse of a move, as a move."""
 
@@ -111,6 +114,7 @@ class Stages:
     table: np.ndarray
 
     def __init__(self, moves: "Sequence[Moves]", table):
+        """**Arguments:** `moves`, and `table`, an array of three columns for each."""
         self.moves = tuple(moves)
         self.table = np.reshape(np.asarray(table, float), (-1, len(self.moves), 3))
 

@@ -49,19 +49,19 @@ separable.
 
 
 class PresymplecticEuler(AbstractPresymplecticSolver):
-    r"""Presymplectic Euler's method.
+    """Presymplectic Euler's method.
 
     1st order. One force evaluation per step. Uses 3rd order Hermite interpolation for
-    dense/ts output in Diffrax's own loop; in that of
-    [`diffrax_presym.FixedStepAdjoint`][] a saved time between steps is a shorter step.
+    dense/ts output in Diffrax's own loop; in that of `FixedStepAdjoint` a saved time
+    between steps is a shorter step.
 
     For separable systems, for which the method is explicit; for others it would be
     implicit. The cheapest scheme. Not symmetric: the two variants are adjoint to each
-    other. [`diffrax_presym.PresymplecticLeapfrog`][] has second order at the same cost;
-    use Euler only where this map itself is wanted, for example as an optimiser. Under
-    strong friction, $x = h \gamma$, the slow motion is $x / (1 - e^{-x})$ times too
-    fast, and the momentum $x / (e^x - 1)$ times what it should be; with
-    `first="position"` the two factors are exchanged.
+    other. `PresymplecticLeapfrog` has second order at the same cost; use Euler only
+    where this map itself is wanted, for example as an optimiser. Under strong friction,
+    `x = h γ`, the slow motion is `x / (1 - exp(-x))` times too fast, and the momentum
+    `x / (exp(x) - 1)` times what it should be; with `first="position"` the two factors
+    are exchanged.
 
     Equations (presymp_euler) and (presymp_euler2) of França, Jordan
     and Vidal (2021).
@@ -89,16 +89,16 @@ PresymplecticEuler.__init__.__doc__ = _ARGUMENTS
 
 
 class PresymplecticLeapfrog(AbstractPresymplecticSolver):
-    r"""The presymplectic leapfrog, also known as Störmer--Verlet.
+    """The presymplectic leapfrog, also known as Störmer--Verlet.
 
     2nd order and symmetric. One force evaluation per step. Uses 3rd order Hermite
     interpolation for dense/ts output in Diffrax's own loop; in that of
-    [`diffrax_presym.FixedStepAdjoint`][] a saved time between steps is a shorter step.
+    `FixedStepAdjoint` a saved time between steps is a shorter step.
 
     For separable systems, for which the method is explicit; for others it would be
     implicit. For large steps and low accuracy, such as in optimisation: no scheme of
     this cost is stable at longer steps. For more than a few digits, schemes of higher
-    order are cheaper; [`diffrax_presym.TunedRKN6`][] is the default choice.
+    order are cheaper; `TunedRKN6` is the default choice.
 
     With `first="momentum"` the last force of a step is reused by the next step and by
     dense output. With `first="position"` the error is often smaller, but dense output
@@ -111,9 +111,9 @@ class PresymplecticLeapfrog(AbstractPresymplecticSolver):
         pass only the state `y` (the default), or the `solver_state` with
         `made_jump=True`.
 
-    Stable under any friction, at a rate $\gamma$ with $x = h \gamma$: the slow motion
-    is $(x / 2) \coth(x / 2)$ times too fast, and the momentum too large by this factor,
-    with `first="position"` $(x / 2) / \sinh(x / 2)$ times what it should be.
+    Stable under any friction, at a rate `γ` with `x = h γ`: the slow motion is
+    `(x / 2) coth(x / 2)` times too fast, and the momentum too large by this factor,
+    with `first="position"` `(x / 2) / sinh(x / 2)` times what it should be.
 
     Equations (presymp_leapfrog) and (presymp_leapfrog2) of França, Jordan
     and Vidal (2021).

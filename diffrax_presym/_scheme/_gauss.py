@@ -145,11 +145,11 @@ class PresymplecticGauss(AbstractPresymplecticSolver):
     dense/ts output, in Diffrax's own loop at the cost of up to seven more steps.
 
     For energies that are neither separable nor split, and for mechanics with a mass
-    matrix, [`diffrax_presym.LagrangianSystem`][]. Conformally symplectic to rounding:
-    with friction of log scale $\eta$ the Jacobian of a step satisfies
-    $J^\top \Omega J = e^{\eta(t_0) - \eta(t_1)} \Omega$. All quadratic invariants are
-    preserved too. Six to eight stages and long steps for errors of 1e-9 and less.
-    Separable and split systems have explicit schemes, which cost less.
+    matrix, `LagrangianSystem`. Conformally symplectic to rounding: with friction of log
+    scale `η` the Jacobian of a step satisfies `J^T Ω J = exp(η(t0) - η(t1)) Ω`. All
+    quadratic invariants are preserved too. Six to eight stages and long steps for
+    errors of 1e-9 and less. Separable and split systems have explicit schemes, which
+    cost less.
 
     The iteration stops when its changes no longer decrease, so that the remaining error
     is rounding without a preferred sign, and the state is updated by compensated
@@ -168,8 +168,7 @@ class PresymplecticGauss(AbstractPresymplecticSolver):
     needs a root finder.
 
     Derivatives are those of the implicit function, not of the iterations, in forward
-    and in reverse mode; [`diffrax_presym.FixedStepAdjoint`][] takes gradients in
-    constant memory.
+    and in reverse mode; `FixedStepAdjoint` takes gradients in constant memory.
 
     ??? cite "Reference"
 

@@ -25,10 +25,10 @@ from ._splitting import BlanesCasasRKN8
 
 
 class MultistepTable(NamedTuple):
-    r"""A method as a filter of forces, in the order from the newest to the oldest.
+    """A method as a filter of forces, in the order from the newest to the oldest.
 
-    $\rho(z) = (z - 1)^2 R(z)$, so that a step is a kick and a drift, with a kick $a_n$
-    that is a filtered force: $\sum_i R_i a_{n-i} = \sum_i \sigma_{i+1} g_{n-i}$.
+    `ρ(z) = (z - 1)^2 R(z)`, so that a step is a kick and a drift, with a kick `a_n`
+    that is a filtered force: `Σ_i R_i a_{n-i} = Σ_i σ_{i+1} g_{n-i}`.
     """
 
     forces: tuple[float, ...]  # sigma, without its two zeros
@@ -191,36 +191,35 @@ def _steps(span: Span, carry: _Carry) -> tuple[Array, Array]:
 
 
 class SymmetricMultistep(AbstractPresymplecticSolver):
-    r"""A symmetric multistep method: high order with one force evaluation per step.
+    """A symmetric multistep method: high order with one force evaluation per step.
 
     8th or 10th order. One force evaluation per step. The first `order - 1` steps, and
     as many after a jump or a change of the length of the steps, are steps of
-    [`diffrax_presym.BlanesCasasRKN8`][], of 19 evaluations; their order is 8, and their
-    error far below that of the method. Dense/ts output in Diffrax's own loop takes
-    three of them in each step; that of [`diffrax_presym.FixedStepAdjoint`][] none.
+    `BlanesCasasRKN8`, of 19 evaluations; their order is 8, and their error far below
+    that of the method. Dense/ts output in Diffrax's own loop takes three of them in
+    each step; that of `FixedStepAdjoint` none.
 
-    For a [`diffrax_presym.QuadraticKinetic`][], any potential and at most one constant
-    rate of friction, with steps of one length, at errors of 1e-6 and less: where the
-    force is most of the cost and no frequency is much higher than the others, as for
-    planets and molecules. Not for stiff springs next to soft ones, strong friction,
-    steps that vary, nor for few unknowns and cheap forces, for which
-    [`diffrax_presym.TunedRKN6`][] is faster.
+    For a `QuadraticKinetic`, any potential and at most one constant rate of friction,
+    with steps of one length, at errors of 1e-6 and less: where the force is most of the
+    cost and no frequency is much higher than the others, as for planets and molecules.
+    Not for stiff springs next to soft ones, strong friction, steps that vary, nor for
+    few unknowns and cheap forces, for which `TunedRKN6` is faster.
 
     Symmetric, but not symplectic: the error in the energy stays small over long times
     if the motion is regular and the step is short enough (Hairer, Lubich and Wanner,
-    chapter XV). It is stable for a step times the highest frequency below 0.63 at
-    order 8 and 0.48 at order 10. Beyond, forces alternate from step to step, more and
-    more: a solve that ends so fails. At some steps the method resonates with the
-    motion: if half the step does not reduce the error as the order says, change it by
-    some per cent. A `solver_state` that is not that of `y0` makes a solve fail too. A
-    step has no inverse: [`diffrax_presym.FixedStepAdjoint`][] takes the gradient by
-    checkpoints, for which it needs `max_steps`.
+    chapter XV). It is stable for a step times the highest frequency below 0.63 at order
+    8 and 0.48 at order 10. Beyond, forces alternate from step to step, more and more: a
+    solve that ends so fails. At some steps the method resonates with the motion: if
+    half the step does not reduce the error as the order says, change it by some per
+    cent. A `solver_state` that is not that of `y0` makes a solve fail too. A step has
+    no inverse: `FixedStepAdjoint` takes the gradient by checkpoints, for which it needs
+    `max_steps`.
 
     With half of the friction taken out of positions and half out of momenta,
-    $q = e^{-\gamma t / 2} x$, friction is a force, and errors grow with the distance
-    from the origin. A step is a kick, by a weighted sum of the last forces and kicks,
-    and a drift: the method $\sum_j \alpha_j x_{n+j} = h^2 \sum_j \beta_j x''_{n+j}$
-    written for increments. The momentum at a step is computed from the same history.
+    `q = exp(-γ t / 2) x`, friction is a force, and errors grow with the distance from
+    the origin. A step is a kick, by a weighted sum of the last forces and kicks, and a
+    drift: the method `Σ_j α_j x_{n+j} = h^2 Σ_j β_j x''_{n+j}` written for increments.
+    The momentum at a step is computed from the same history.
 
     ??? cite "Reference"
 

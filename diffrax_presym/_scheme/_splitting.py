@@ -111,7 +111,7 @@ class Splitting(AbstractSplitting):
     def __init__(self, tableau: SplittingTableau):
         """**Arguments:**
 
-        - `tableau`: a [`diffrax_presym.SplittingTableau`][].
+        - `tableau`: a `SplittingTableau`.
 
         **Raises:**
 
@@ -149,18 +149,17 @@ class Splitting(AbstractSplitting):
 
 
 class Strang(AbstractSplitting):
-    r"""Strang's splitting: kick, drift, kick; the leapfrog with an exact drift.
+    """Strang's splitting: kick, drift, kick; the leapfrog with an exact drift.
 
     2nd order and symmetric. One force evaluation per step. Uses 3rd order Hermite
     interpolation for dense/ts output in Diffrax's own loop, at the cost of two more
-    unless the system is separable; in that of [`diffrax_presym.FixedStepAdjoint`][] a
-    saved time between steps is a shorter step.
+    unless the system is separable; in that of `FixedStepAdjoint` a saved time between
+    steps is a shorter step.
 
-    For any system with a kinetic part of known flow, especially
-    [`diffrax_presym.BregmanHamiltonian`][], for which it is explicit and
-    [`diffrax_presym.PresymplecticLeapfrog`][] is not. Stable under any friction: with
-    a rate $\gamma$ and an exact drift positions are right, and momenta at the ends of
-    steps $(x / 2) \coth(x / 2)$ times too large, $x = h \gamma$.
+    For any system with a kinetic part of known flow, especially `BregmanHamiltonian`,
+    for which it is explicit and `PresymplecticLeapfrog` is not. Stable under any
+    friction: with a rate `γ` and an exact drift positions are right, and momenta at the
+    ends of steps `(x / 2) coth(x / 2)` times too large, `x = h γ`.
 
     ??? cite "Reference"
 
@@ -182,9 +181,8 @@ class BlanesMoan4(AbstractSplitting):
     4th order and symmetric. Six force evaluations per step. Uses Hermite interpolation
     for dense/ts output, in Diffrax's own loop at the cost of another step.
 
-    For any system with a kinetic part of known flow, such as a relativistic one.
-    If the kinetic energy or the potential is quadratic,
-    [`diffrax_presym.BlanesMoanRKN4`][] is more efficient.
+    For any system with a kinetic part of known flow, such as a relativistic one. If the
+    kinetic energy or the potential is quadratic, `BlanesMoanRKN4` is more efficient.
 
     ??? cite "Reference"
 
@@ -208,9 +206,9 @@ class BlanesMoan6(AbstractSplitting):
     for dense/ts output, in Diffrax's own loop at the cost of three more steps.
 
     For any system with a kinetic part of known flow. If the kinetic energy or the
-    potential is quadratic, [`diffrax_presym.TunedRKN6`][] is more efficient.
+    potential is quadratic, `TunedRKN6` is more efficient.
 
-    Source: Blanes and Moan (2002), see [`diffrax_presym.BlanesMoan4`][].
+    Source: Blanes and Moan (2002), see `BlanesMoan4`.
     """
 
     tableau: ClassVar[SplittingTableau] = BLANES_MOAN_6
@@ -223,9 +221,9 @@ class BlanesMoanRKN4(AbstractSplitting):
     for dense/ts output, in Diffrax's own loop at the cost of another step.
 
     For quadratic kinetic energies or quadratic potentials, at low accuracy, where steps
-    of [`diffrax_presym.TunedRKN6`][] are too long.
+    of `TunedRKN6` are too long.
 
-    Source: Blanes and Moan (2002), see [`diffrax_presym.BlanesMoan4`][].
+    Source: Blanes and Moan (2002), see `BlanesMoan4`.
     """
 
     tableau: ClassVar[SplittingTableau] = BLANES_MOAN_RKN_4
@@ -238,10 +236,10 @@ class BlanesMoanRKN6(AbstractSplitting):
     interpolation for dense/ts output, in Diffrax's own loop at the cost of three more
     steps.
 
-    For quadratic kinetic energies or quadratic potentials. For oscillations
-    [`diffrax_presym.TunedRKN6`][] is more accurate.
+    For quadratic kinetic energies or quadratic potentials. For oscillations `TunedRKN6`
+    is more accurate.
 
-    Source: Blanes and Moan (2002), see [`diffrax_presym.BlanesMoan4`][].
+    Source: Blanes and Moan (2002), see `BlanesMoan4`.
     """
 
     tableau: ClassVar[SplittingTableau] = BLANES_MOAN_RKN_6
@@ -280,40 +278,39 @@ class TunedRKN6(AbstractSplitting):
     steps.
 
     For quadratic kinetic energies or quadratic potentials: the first choice, with
-    [`diffrax_presym.choose_step`][]. For oscillations about equilibria its error is
-    much smaller than that of [`diffrax_presym.BlanesMoanRKN6`][] at equal cost.
+    `choose_step`. For oscillations about equilibria its error is much smaller than that
+    of `BlanesMoanRKN6` at equal cost.
 
     Source: this package, `benchmarks/tuning.py`. The coefficients satisfy the
     conditions of order 6, and reduce the remaining error for oscillators over a range
     of frequencies and, at the next order, for any force.
 
-    Its steps are long. Between them, interpolated by
-    [`diffrax_presym.FixedStepAdjoint`][], the error may be 10 to 350 times that at
-    their ends, which [`diffrax_presym.choose_step`][] takes into account.
+    Its steps are long. Between them, interpolated by `FixedStepAdjoint`, the error may
+    be 10 to 350 times that at their ends, which `choose_step` takes into account.
     """
 
     tableau: ClassVar[SplittingTableau] = TUNED_RKN_6
 
 
 class TunedLinear8(AbstractSplitting):
-    r"""A splitting for linear forces, with steps of half a period or more.
+    """A splitting for linear forces, with steps of half a period or more.
 
     8th order and symmetric for linear forces and constant friction. Fourteen force
     evaluations per step. Uses Hermite interpolation for dense/ts output, in Diffrax's
     own loop at the cost of three more steps.
 
     For forces linear in the positions, by a matrix or a stencil, written as
-    [`diffrax_presym.QuadraticPotential`][]: damped waves, networks of springs,
-    quadratic objectives. It allows the longest steps per force evaluation: the error of
-    a step is 1e-9 if the step times the highest frequency is 3.6, or 0.26 per
-    evaluation. Its coefficients are tuned for a range of frequencies rather than for
-    short steps. With friction split between positions and momenta, $q = e^{-\gamma t /
-    2} x$, the motion of $x$ is again an oscillation, so that constant friction costs no
-    accuracy up to rates of twice the highest frequency.
+    `QuadraticPotential`: damped waves, networks of springs, quadratic objectives. It
+    allows the longest steps per force evaluation: the error of a step is 1e-9 if the
+    step times the highest frequency is 3.6, or 0.26 per evaluation. Its coefficients
+    are tuned for a range of frequencies rather than for short steps. With friction
+    split between positions and momenta, `q = exp(-γ t / 2) x`, the motion of `x` is
+    again an oscillation, so that constant friction costs no accuracy up to rates of
+    twice the highest frequency.
 
     Any other system is refused. Interpolation over such long steps is inaccurate, so in
-    the loop of [`diffrax_presym.FixedStepAdjoint`][] a saved time between steps is a
-    shorter step of the scheme; use that loop.
+    the loop of `FixedStepAdjoint` a saved time between steps is a shorter step of the
+    scheme; use that loop.
 
     Source: this package, `benchmarks/tuning.py`.
     """

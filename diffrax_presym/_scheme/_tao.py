@@ -106,23 +106,23 @@ def rotate(angle: Array, y: State) -> State:
 
 
 class PresymplecticTao(AbstractPresymplecticSolver):
-    r"""Tao's augmented integrator, explicit for every Hamiltonian.
+    """Tao's augmented integrator, explicit for every Hamiltonian.
 
     2nd order, symmetric, and conformally symplectic in the doubled phase space. Three
     evaluations of velocity and force per step. Uses 3rd order Hermite interpolation for
     dense/ts output in Diffrax's own loop, at the cost of two more; in that of
-    [`diffrax_presym.FixedStepAdjoint`][] a saved time between steps is a shorter step.
+    `FixedStepAdjoint` a saved time between steps is a shorter step.
 
-    The phase space is doubled: the copy $(\bar q, \bar p)$ replaces the arguments that
-    would make the scheme implicit, and a harmonic coupling of strength $\xi$ keeps it
-    close. Both copies share one moving frame, in which the coupling acts unscaled, so
-    that it stays of the size of the dynamics under damping. The solution is the
-    original, and the `solver_state` holds the copy.
+    The phase space is doubled: the copy `(q2, p2)` replaces the arguments that would
+    make the scheme implicit, and a harmonic coupling of strength `ξ` keeps it close.
+    Both copies share one moving frame, in which the coupling acts unscaled, so that it
+    stays of the size of the dynamics under damping. The solution is the original, and
+    the `solver_state` holds the copy.
 
-    The scheme of the paper for nonseparable Hamiltonians.
-    [`diffrax_presym.PresymplecticGauss`][] is faster to almost any error, preserves the
-    structure in the phase space itself, and has no coupling to choose. A step of more
-    friction than 3.2, the rate times its length, makes a solve fail.
+    The scheme of the paper for nonseparable Hamiltonians. `PresymplecticGauss` is
+    faster to almost any error, preserves the structure in the phase space itself, and
+    has no coupling to choose. A step of more friction than 3.2, the rate times its
+    length, makes a solve fail.
 
     If the step is too long or the copies separate, a solve ends with
     `RESULTS.nonfinite` or has no accuracy: compare its energies. Take shorter steps, or
@@ -144,16 +144,15 @@ class PresymplecticTao(AbstractPresymplecticSolver):
     coupling: Inexact[Array, ""] | None
 
     def __init__(self, coupling=None):
-        r"""**Arguments:**
+        """**Arguments:**
 
-        - `coupling`: the strength $\xi$ of the coupling, positive, in units of one over
-            time. A few times the highest frequency of the system is a good value.
-            Avoid $2 \xi h$ near a multiple of $\pi$, where the coupling resonates with
-            the step. Defaults to `None`, which is $\xi = 3\pi / 16h$, half-way between
-            resonance and copies that drift apart. That is one angle per step of any
-            length, so not for use inside a [`diffrax_presym.Composition`][], nor with
-            `diffrax.HalfSolver`, whose error estimate then does not vanish with the
-            step.
+        - `coupling`: the strength `ξ` of the coupling, positive, in units of one over
+            time. A few times the highest frequency of the system is a good value. Avoid
+            `2 ξ h` near a multiple of `π`, where the coupling resonates with the step.
+            Defaults to `None`, which is `ξ = 3π / 16h`, half-way between resonance and
+            copies that drift apart. That is one angle per step of any length, so not
+            for use inside a `Composition`, nor with `diffrax.HalfSolver`, whose error
+            estimate then does not vanish with the step.
 
         **Raises:**
 

@@ -10,7 +10,7 @@ from ._solution import check_times, check_tolerance, Solution
 
 
 class ChosenStep(NamedTuple):
-    """A constant step size, chosen by [`diffrax_presym.choose_step`][].
+    """A constant step size, chosen by `choose_step`.
 
     **Attributes:**
 
@@ -21,7 +21,7 @@ class ChosenStep(NamedTuple):
     - `order`: the measured order, `nan` if errors are those of rounding, or far below
         the tolerance with the fewest steps.
     - `claimed_order`: the order of the scheme, if the solve tells it: with
-        [`diffrax_presym.FixedStepAdjoint`][]; otherwise `None`.
+        `FixedStepAdjoint`; otherwise `None`.
     - `on_grid`: whether the step divides the spacing of the saved times, or is a
         multiple of it.
     - `smooth`: whether the errors of solves follow the law of convergence. If not, as
@@ -70,13 +70,13 @@ def choose_step(
     max_steps: int = 1_000_000,
     on_trial: Callable[[Trial], Any] | None = None,
 ) -> ChosenStep:
-    r"""The constant step size with which a solve reaches a tolerance, per entry of the
+    """The constant step size with which a solve reaches a tolerance, per entry of the
     solution.
 
     Unlike the tolerance of `diffrax.PIDController`, which is for the error of one step,
     this one is for the error of the solution: of each entry of all that is saved,
-    $|y - \bar y| \le \mathtt{atol} + \mathtt{rtol} \, |\bar y|$ with the exact
-    $\bar y$. The largest error relative to that is aimed at 0.4 to 1.
+    `|y - y2| ≤ atol + rtol |y2|` with the exact `y2`. The largest error relative to
+    that is aimed at 0.4 to 1.
 
     `solve` is any function from a step to a `diffrax.Solution`: with any solver, any
     wrapper, `SaveAt`, arguments and events, of which times are compared too. Under
@@ -86,18 +86,18 @@ def choose_step(
     three solves agree with an order, by Richardson extrapolation, and the tolerance is
     reached. One or two more solves then have to confirm that errors fall as those of a
     smooth motion, with steps that have another phase; if they do not, the steps are
-    doubled once more, and the result has a note: [`diffrax_presym.ChosenStep`][] with
-    `smooth=False`. Then a smaller number of steps is searched, whose errors are
-    measured against the finest solve: about as long as ten solves with the chosen step.
+    doubled once more, and the result has a note: `ChosenStep` with `smooth=False`. Then
+    a smaller number of steps is searched, whose errors are measured against the finest
+    solve: about as long as ten solves with the chosen step.
 
     A parameter that scales steps is found in the same way, such as `epsilon` of
-    [`diffrax_presym.StepDensityController`][]: what `solve` is given is then not a
-    step, but the number of steps that it takes falls as that grows.
+    `StepDensityController`: what `solve` is given is then not a step, but the number of
+    steps that it takes falls as that grows.
 
     The step divides the span. A saved time inside of a step costs a step more, unless
-    [`diffrax_presym.FixedStepAdjoint`][] interpolates it. So if the saved times are on
-    a grid that divides the span, and steps that end at all of them cost no more, such a
-    step is chosen. The error may then be much smaller than aimed at.
+    `FixedStepAdjoint` interpolates it. So if the saved times are on a grid that divides
+    the span, and steps that end at all of them cost no more, such a step is chosen. The
+    error may then be much smaller than aimed at.
 
     It needs concrete numbers, so it is called outside of `jax.jit`. It knows only the
     solve that it is given: for other parameters choose another step, and in a batch
@@ -139,7 +139,7 @@ def choose_step(
 
     **Returns:**
 
-    A [`diffrax_presym.ChosenStep`][].
+    A `ChosenStep`.
 
     **Raises:**
 

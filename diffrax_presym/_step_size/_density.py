@@ -14,19 +14,18 @@ from .._system._base import AbstractSystem
 
 
 class StepDensityController(dfx.AbstractStepSizeController):
-    r"""Reversible variable steps, $h \approx \epsilon \sigma(t, y)$.
+    """Reversible variable steps, `h ≈ ε σ(t, y)`.
 
     With steps chosen by an error estimate, the energy error of a symmetric scheme grows
     with time. Here two successive steps satisfy, at their common end,
 
-    $$\frac{1}{h_{n+1/2}} + \frac{1}{h_{n-1/2}} = \frac{2}{\epsilon \sigma(t_n, y_n)}$$
+    `1 / h_{n+1/2} + 1 / h_{n-1/2} = 2 / (ε σ(t_n, y_n))`
 
     (adaptive Verlet), which is the same in both directions of time. A solve backwards
     from its end then takes the same steps, and energy errors stay bounded as with
     constant steps. The first step extends this symmetry to the start,
 
-    $$\frac{1}{h_{1/2}} = \frac{1}{\epsilon \sigma} - \frac{1}{2 \sigma}
-    \frac{\mathrm d \sigma}{\mathrm d t} \quad \text{at } (t_0, y_0),$$
+    `1 / h_{1/2} = 1 / (ε σ) - (dσ/dt) / (2 σ)` at `(t0, y0)`,
 
     with the derivative along the motion. Steps are never rejected.
 
@@ -38,21 +37,19 @@ class StepDensityController(dfx.AbstractStepSizeController):
 
     The density may be the system itself. Its time scale is then taken,
 
-    $$\sigma = \Big( \sum_{ij} \Big( \frac{\partial \ddot q_i}{\partial q_j}
-    \Big)^2 \Big)^{-1/4}$$
+    `σ = (Σ_ij (∂q''_i / ∂q_j)^2)^(-1/4)`
 
-    with the accelerations $\ddot q$ of all but linear friction: of an oscillation
-    $1 / \omega$, of bodies that attract each other a power 3/2 of the distance, as in
-    Kepler's third law, so that a close encounter takes as many steps as a distant one.
-    It costs as many directional derivatives of the force per step as there are
-    positions. For many bodies give it as a function: of several distances
-    $\big( \sum_k r_k^{-3} \big)^{-1/2}$. `epsilon` of 0.1 is about 63 steps for each
-    period.
+    with the accelerations `q''` of all but linear friction: of an oscillation `1 / ω`,
+    of bodies that attract each other a power 3/2 of the distance, as in Kepler's third
+    law, so that a close encounter takes as many steps as a distant one. It costs as
+    many directional derivatives of the force per step as there are positions. For many
+    bodies give it as a function: of several distances `(Σ_k r_k^-3)^(-1/2)`. `epsilon`
+    of 0.1 is about 63 steps for each period.
 
     Requires `dt0=None`. A solve fails with `RESULTS.step_density_missed` if a step
-    differs from $\epsilon \sigma$ at one of its ends by more than a factor of four, as
-    `epsilon` is then too large; with `RESULTS.step_density_invalid` where the density
-    is not positive and finite; and with `RESULTS.dt_min_reached` if a step vanishes.
+    differs from `ε σ` at one of its ends by more than a factor of four, as `epsilon` is
+    then too large; with `RESULTS.step_density_invalid` where the density is not
+    positive and finite; and with `RESULTS.dt_min_reached` if a step vanishes.
 
     ??? cite "Reference"
 
@@ -70,11 +67,11 @@ class StepDensityController(dfx.AbstractStepSizeController):
     direction: ArrayLike
 
     def __init__(self, epsilon: ArrayLike, density: Callable | AbstractSystem):
-        r"""**Arguments:**
+        """**Arguments:**
 
-        - `epsilon`: the step size $\epsilon$ where the density is one; a positive
-            number, in units of time if the density has none.
-        - `density`: the step density $\sigma$: the system, whose time scale it is; or a
+        - `epsilon`: the step size `ε` where the density is one; a positive number, in
+            units of time if the density has none.
+        - `density`: the step density `σ`: the system, whose time scale it is; or a
             function `density(t, y, args)` that returns a positive scalar, for example
             `lambda t, y, args: jnp.linalg.norm(y[0]) ** 1.5`.
 
@@ -158,7 +155,7 @@ class StepDensityController(dfx.AbstractStepSizeController):
         return 2 / self._length(t, y, args) - controller_state
 
     def _length(self, t, y, args):
-        r"""$\epsilon \sigma$."""
+        """`ε σ`."""
         t = as_time(t)
         sigma = self.density(self.direction * t, y, args)
         if jnp.shape(sigma) != () or not jnp.isrealobj(sigma):
@@ -189,6 +186,6 @@ class TimeScale(eqx.Module):
 
 
 def _follows(ratio):
-    r"""Whether two steps with the common end are within a factor of four of
-    $\epsilon \sigma$ there, of which the one is $\epsilon \sigma$ over `ratio`."""
+    """Whether two steps with the common end are within a factor of four of `ε σ`
+    there, of which the one is `ε σ` over `ratio`."""
     return jnp.abs(ratio - 1) <= 0.75

@@ -25,17 +25,17 @@ P = PyTree[Inexact[Array, "..."]]
 
 
 class AbstractSystem(dfx.AbstractTerm):
-    r"""A mechanical system: the equations of motion, as a Diffrax term.
+    """A mechanical system: the equations of motion, as a Diffrax term.
 
     The state is a pair `(q, p)` of pytrees of one structure, the positions and the
-    *mechanical* momenta. With an energy $E$ and a log scale $\eta$ of the friction, the
-    Hamiltonian is $H(t, q, P) = e^{\eta(t)} E(t, q, e^{-\eta(t)} P)$, and
-    $p = e^{-\eta(t)} P$: it stays of the size of the velocity under damping, where the
-    canonical momentum $P$ overflows in `float32` once $\eta(t)$ exceeds 88.
+    *mechanical* momenta. With an energy `E` and a log scale `η` of the friction, the
+    Hamiltonian is `H(t, q, P) = exp(η(t)) E(t, q, exp(-η(t)) P)`, and
+    `p = exp(-η(t)) P`: it stays of the size of the velocity under damping, where the
+    canonical momentum `P` overflows in `float32` once `η(t)` exceeds 88.
 
     Pass it to `diffrax.diffeqsolve`, with a solver of this package or any other of
     Diffrax for ordinary differential equations, which uses the full vector field
-    $(\partial E/\partial p, -\partial E/\partial q - \eta'(t) \, p)$.
+    `(∂E/∂p, -∂E/∂q - η'(t) p)`.
 
     To write a system of your own, subclass it with `energy`, `velocity`, `force` and
     `splits`.
@@ -49,16 +49,16 @@ class AbstractSystem(dfx.AbstractTerm):
 
     @abc.abstractmethod
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
-        """The mechanical energy $E(t, q, p)$."""
+        """The mechanical energy `E(t, q, p)`."""
 
     @abc.abstractmethod
     def velocity(self, t: Time, q: Q, p: P, args: PyTree = None) -> Q:
-        r"""The velocity $\partial E / \partial p$."""
+        """The velocity `∂E / ∂p`."""
 
     @abc.abstractmethod
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
-        r"""The force $-\partial E / \partial q$, and all other forces but linear
-        friction that depends on time alone."""
+        """The force `-∂E / ∂q`, and all other forces but linear friction that depends
+        on time alone."""
 
     # What is different for some systems.
 
@@ -186,12 +186,12 @@ class AbstractSystem(dfx.AbstractTerm):
     # Canonical momenta, and velocities.
 
     def log_scale(self, t: Time) -> Scalar:
-        r"""The log scale $\eta(t)$; 0 for a system without damping."""
+        """The log scale `η(t)`; 0 for a system without damping."""
         t = as_time(t)
         return jnp.zeros_like(t) if self.damping is None else self.damping(t)
 
     def canonical(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
-        r"""The value of the Hamiltonian, $e^{\eta(t)} E(t, q, p)$.
+        """The value of the Hamiltonian, `exp(η(t)) E(t, q, p)`.
 
         `p` is the mechanical momentum, as in a solution.
         """
@@ -199,11 +199,11 @@ class AbstractSystem(dfx.AbstractTerm):
         return tree.scale(jnp.exp(self.log_scale(t)), energy)
 
     def to_canonical(self, t: Time, p: P) -> P:
-        r"""From the mechanical momentum to the canonical, $P = e^{\eta(t)} p$."""
+        """From the mechanical momentum to the canonical, `P = exp(η(t)) p`."""
         return tree.scale(jnp.exp(self.log_scale(t)), p)
 
     def from_canonical(self, t: Time, P: P) -> P:
-        r"""From the canonical momentum to the mechanical, $p = e^{-\eta(t)} P$."""
+        """From the canonical momentum to the mechanical, `p = exp(-η(t)) P`."""
         return tree.scale(jnp.exp(-self.log_scale(t)), P)
 
     def from_velocity(self, t: Time, y: tuple[Q, Q], args: PyTree = None) -> State:
@@ -216,6 +216,9 @@ class AbstractSystem(dfx.AbstractTerm):
         `SaveAt(..., fn=system.to_velocity)`."""
         q, p = y
         return q, self.velocity(t, q, p, args)
+
+
+AbstractSystem.__init__.__doc__ = "**Arguments:** its fields, if any."
 
 
 @eqx.filter_jit  # Outside of a solve, it would be compiled again by each call.

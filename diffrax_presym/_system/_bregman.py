@@ -40,26 +40,20 @@ class BregmanSplit(AbstractSplit):
 
 
 class BregmanHamiltonian(AbstractSystem):
-    r"""The Bregman Hamiltonian, whose motion minimises a function $f$,
-    $H = e^{\alpha + \gamma} [ D_{h^*}(\nabla h(q) + e^{-\gamma} P, \nabla h(q))
-    + e^\beta f(q) ]$.
+    """The Bregman Hamiltonian, whose motion minimises a function `f`, `H = exp(α + γ)
+    [D(∇h(q) + exp(-γ) P, ∇h(q)) + exp(β) f(q)]`.
 
     Equation (bregman_ham) of França, Jordan and Vidal (2021), after Wibisono, Wilson
-    and Jordan (2016), where $D_{h^*}$ is the Bregman divergence of the convex dual of
-    the mirror map $h$. The log scale is $\gamma$, so the state holds
-    $p = e^{-\gamma} P$, and with $m = \nabla h^*(\nabla h(q) + p)$ the equations of
-    motion are
+    and Jordan (2016), where `D` is the Bregman divergence of the convex dual of the
+    mirror map `h`. The log scale is `γ`, so the state holds `p = exp(-γ) P`, and with
+    `m = ∇h^*(∇h(q) + p)` the equations of motion are
 
-    $$\dot q = e^\alpha (m - q), \qquad
-    \frac{\mathrm d}{\mathrm dt} \big( \nabla h(q) + p \big)
-    = -e^{\alpha + \beta} \nabla f(q).$$
+    `q' = exp(α) (m - q)` and `d/dt (∇h(q) + p) = -exp(α + β) ∇f(q)`.
 
-    During a drift $m$ is constant and $q$ decays towards it like $e^{-\gamma}$. So the
+    During a drift `m` is constant and `q` decays towards it like `exp(-γ)`. So the
     drift is known in closed form for every mirror map, and splittings for any kinetic
-    energy are explicit, such as [`diffrax_presym.Strang`][] and
-    [`diffrax_presym.BlanesMoan4`][]. They need $\nabla h$ and $\nabla h^*$ but no
-    second derivatives. With [`diffrax_presym.EuclideanMirror`][] the Hamiltonian is
-    separable.
+    energy are explicit, such as `Strang` and `BlanesMoan4`. They need `∇h` and `∇h^*`
+    but no second derivatives. With `EuclideanMirror` the Hamiltonian is separable.
 
     A solve fails if positions leave the domain of the mirror map, if its root find
     fails, or if a value is not finite.
@@ -70,14 +64,13 @@ class BregmanHamiltonian(AbstractSystem):
     scaling: Scaling
 
     def __init__(self, mirror_map, objective, scaling):
-        r"""**Arguments:**
+        """**Arguments:**
 
-        - `mirror_map`: the mirror map $h$, for example
-            [`diffrax_presym.EntropyMirror`][].
+        - `mirror_map`: the mirror map `h`, for example `EntropyMirror`.
         - `objective`: the function to minimise, a function `f(t, q, args)` that returns
             a scalar.
-        - `scaling`: the functions $\alpha$, $\beta$ and $\gamma$ of time, for example
-            [`diffrax_presym.PolynomialScaling`][].
+        - `scaling`: the functions `α`, `β` and `γ` of time, for example
+            `PolynomialScaling`.
 
         **Raises:**
 

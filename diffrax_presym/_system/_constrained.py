@@ -27,19 +27,18 @@ from ._split import AbstractSplit
 
 
 class ConstrainedSystem(AbstractSystem):
-    r"""A mechanical system with holonomic constraints $g(t, q) = 0$,
+    """A mechanical system with holonomic constraints `g(t, q) = 0`,
 
-    $$q' = M^{-1} p, \qquad p' = F - \Gamma p - G^\top \lambda, \qquad
-    G = \frac{\partial g}{\partial q},$$
+    `q' = M^-1 p` and `p' = F - Γ p - G^T λ` with `G = ∂g/∂q`,
 
-    whose multipliers $\lambda$ keep $g$ and its rate of change
-    $G M^{-1} p + \partial g / \partial t$ zero, to rounding.
+    whose multipliers `λ` keep `g` and its rate of change `G M^-1 p + ∂g / ∂t` zero, to
+    rounding.
 
-    [`diffrax_presym.Strang`][] is then RATTLE (Andersen 1983): symmetric, of second
-    order, with exact friction, and conformally symplectic if that is one rate.
-    Compositions, `Suzuki4(Strang())` or `SofroniouSpaletta(6, Strang())`, are of higher
-    order; so are [`diffrax_presym.BlanesMoan4`][] and [`diffrax_presym.BlanesMoan6`][],
-    whose drifts are compositions, for expensive forces. Other schemes are refused.
+    `Strang` is then RATTLE (Andersen 1983): symmetric, of second order, with exact
+    friction, and conformally symplectic if that is one rate. Compositions,
+    `Suzuki4(Strang())` or `SofroniouSpaletta(6, Strang())`, are of higher order; so are
+    `BlanesMoan4` and `BlanesMoan6`, whose drifts are compositions, for expensive
+    forces. Other schemes are refused.
 
     A step whose multipliers are not found fails. Start from `system.project(t0, y0,
     args)`. In Diffrax's loop save values between steps by `SaveAt(ts=ts,
@@ -75,9 +74,8 @@ class ConstrainedSystem(AbstractSystem):
     ):
         """**Arguments:**
 
-        - `system`: a [`diffrax_presym.MechanicalSystem`][] with a quadratic kinetic
-            energy, any friction, and forces that do not depend on the velocity
-            otherwise.
+        - `system`: a `MechanicalSystem` with a quadratic kinetic energy, any friction,
+            and forces that do not depend on the velocity otherwise.
         - `constraint`: a function `g(t, q, args)` that returns an array, zero where the
             constraints hold, or a scalar.
         - `linear_solver`: a Lineax solver for the multipliers. Defaults to `None`, by
@@ -157,12 +155,12 @@ class ConstrainedSystem(AbstractSystem):
         return jax.jvp(value, (t, q), (dt, v))[1]
 
     def normal(self, t: Time, q: Q, args: PyTree) -> Callable[[Multipliers], P]:
-        r"""The map from multipliers to momenta, $G^\top$."""
+        """The map from multipliers to momenta, `G^T`."""
         pull = jax.vjp(lambda q: self.value(t, q, args), q)[1]
         return lambda x: pull(x)[0]
 
     def _matrix(self, t: Time, q: Q, args: PyTree) -> LinearMap:
-        r"""The map $G M^{-1} G^\top$."""
+        """The map `G M^-1 G^T`."""
         normal = self.normal(t, q, args)
         return lambda x: self.rate(t, q, normal(x), args, flow=0.0)
 
@@ -205,7 +203,7 @@ class ConstrainedSystem(AbstractSystem):
 
     @eqx.filter_jit  # Outside of a solve, it would be compiled again by each call.
     def project(self, t: Time, y: State, args: PyTree = None) -> State:
-        """The state with positions moved along $M^{-1} G^T$ until the constraints hold,
+        """The state with positions moved along `M^-1 G^T` until the constraints hold,
         and the nearest momentum for which their rates of change are zero.
 
         **Raises:**

@@ -13,21 +13,20 @@ from ._split import AbstractSplit
 
 
 class Hamiltonian(AbstractSystem):
-    r"""Any energy $E(t, q, p)$, with friction and any other force.
+    """Any energy `E(t, q, p)`, with friction and any other force.
 
-    For energies that are not a sum $T(t, p) + V(t, q)$, which
-    [`diffrax_presym.MechanicalSystem`][] takes: use
-    [`diffrax_presym.PresymplecticGauss`][]. If part of its motion has a known flow,
-    such as along Kepler's orbits, pass that as a split: splittings are then explicit.
+    For energies that are not a sum `T(t, p) + V(t, q)`, which `MechanicalSystem` takes:
+    use `PresymplecticGauss`. If part of its motion has a known flow, such as along
+    Kepler's orbits, pass that as a split: splittings are then explicit.
 
     !!! warning
 
-        Damping acts on the momentum $p$ of the energy, which is not always the mass
-        times the velocity. With a vector potential, $E = |p - A(q)|^2 / 2$, or in
+        Damping acts on the momentum `p` of the energy, which is not always the mass
+        times the velocity. With a vector potential, `E = |p - A(q)|^2 / 2`, or in
         general coordinates, it is not friction of the velocity, and the result depends
-        on the choice of $A$. For a charge in a magnetic field with friction use
-        [`diffrax_presym.ViscousDamping`][], for a mass matrix that depends on the
-        positions [`diffrax_presym.LagrangianSystem`][].
+        on the choice of `A`. For a charge in a magnetic field with friction use
+        `ViscousDamping`, for a mass matrix that depends on the positions
+        `LagrangianSystem`.
     """
 
     fn: Callable
@@ -36,19 +35,18 @@ class Hamiltonian(AbstractSystem):
     known: tuple[AbstractSplit, ...] | None
 
     def __init__(self, energy, friction=None, *, force=None, splits=()):
-        r"""**Arguments:**
+        """**Arguments:**
 
         - `energy`: the energy, a function `E(t, q, p, args)` that returns a scalar.
-        - `friction`: a law of friction by rates or by place, such as
-            [`diffrax_presym.ConstantDamping`][], or a list of laws. The mass is not
-            known, so that friction per velocity has to be written as `force`. Defaults
-            to none.
+        - `friction`: a law of friction by rates or by place, such as `ConstantDamping`,
+            or a list of laws. The mass is not known, so that friction per velocity has
+            to be written as `force`. Defaults to none.
         - `force`: any further force, a function `f(t, q, v, args)` of the velocity `v`,
-            as for [`diffrax_presym.MechanicalSystem`][]. Defaults to none.
+            as for `MechanicalSystem`. Defaults to none.
         - `splits`: pairs of exact flows into which the motion splits, a tuple of
-            [`diffrax_presym.extend.AbstractSplit`][], the best first. Linear friction
-            is part of their drifts; they are not used with any other friction or force.
-            Defaults to none.
+            `extend.AbstractSplit`, the best first. Linear friction is part of their
+            drifts; they are not used with any other friction or force. Defaults to
+            none.
 
         **Raises:**
 

@@ -34,12 +34,12 @@ class _Equation(eqx.Module):
 def force_flow(
     force: _Force, h: Time, p: PyTree, order: int
 ) -> tuple[PyTree, Bool[Array, ""]]:
-    r"""The change of a momentum by a force over a length `h`, and whether it was found.
+    """The change of a momentum by a force over a length `h`, and whether it was found.
 
-    Of at least the given order, and symmetric: the length `-h` is the inverse. By
-    $p_1 - p_0 = \sum_j c_j h^j (g_0^{(j-1)} - (-1)^j g_1^{(j-1)})$ with $k$ derivatives
-    at both ends and the coefficients of the Padé approximation of the exponential, of
-    order $2 k$. Collocation would have more unknowns, and a guess that is worse.
+    Of at least the given order, and symmetric: the length `-h` is the inverse. By `p_1
+    - p_0 = Σ_j c_j h^j (g_0^(j-1) - (-1)^j g_1^(j-1))` with `k` derivatives at both
+    ends and the coefficients of the Padé approximation of the exponential, of order
+    `2 k`. Collocation would have more unknowns, and a guess that is worse.
     """
     k, h = (order + 1) // 2, as_time(h)
     taylor = [h**j / math.factorial(j) for j in range(1, k + 1)]

@@ -35,7 +35,7 @@ class AbstractKinetic(eqx.Module):
 
     @abc.abstractmethod
     def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
-        r"""The velocity $\partial T / \partial p$."""
+        """The velocity `∂T / ∂p`."""
 
     def flow_is_known(self, friction: LinearFriction | None) -> bool:
         """Whether its flow is known in closed form."""
@@ -81,7 +81,10 @@ class AbstractKinetic(eqx.Module):
 
     @abc.abstractmethod
     def rescale(self, s: Scalar) -> "AbstractKinetic":
-        r"""The kinetic energy $T_s(p) = e^{-2s} \, T(e^s p)$, without overflow."""
+        """The kinetic energy `T_s(p) = exp(-2s) T(exp(s) p)`, without overflow."""
+
+
+AbstractKinetic.__init__.__doc__ = "**Arguments:** its fields, if any."
 
 
 _OF_POSITIONS = (
@@ -90,7 +93,7 @@ _OF_POSITIONS = (
 
 
 class QuadraticKinetic(AbstractKinetic):
-    r"""The kinetic energy $T(p) = \tfrac12 \, p \cdot M^{-1} p$."""
+    """The kinetic energy `T(p) = p · M^-1 p / 2`."""
 
     mass: PyTree[Inexact[Array, "..."]] | lx.AbstractLinearOperator | None
     symmetric: bool = eqx.field(static=True)
@@ -136,7 +139,7 @@ class QuadraticKinetic(AbstractKinetic):
         return divide(self.mass, p, MASS, "p", self.symmetric)
 
     def momentum(self, v: PyTree) -> PyTree:
-        """The momentum $M v$ of a velocity."""
+        """The momentum `M v` of a velocity."""
         return multiply(self.mass, v, MASS, "q", self.symmetric)
 
     def flow_is_known(self, friction) -> bool:
@@ -156,10 +159,10 @@ class QuadraticKinetic(AbstractKinetic):
 
 
 class RelativisticKinetic(AbstractKinetic):
-    r"""The kinetic energy $T(p) = c \sqrt{p \cdot p + m^2 c^2}$ of one particle.
+    """The kinetic energy `T(p) = c sqrt(p · p + m^2 c^2)` of one particle.
 
     All entries of `p` together are the momentum of one particle, whose speed never
-    exceeds $c$. As a kinetic energy for optimisation, equation (rel_ham) of França,
+    exceeds `c`. As a kinetic energy for optimisation, equation (rel_ham) of França,
     Jordan and Vidal (2021), it bounds the size of a step.
     """
 
@@ -169,8 +172,8 @@ class RelativisticKinetic(AbstractKinetic):
     def __init__(self, mass: ArrayLike = 1.0, speed: ArrayLike = 1.0):
         """**Arguments:**
 
-        - `mass`: the rest mass $m$, a positive number. Defaults to 1.
-        - `speed`: the speed of light $c$, a positive number. Defaults to 1.
+        - `mass`: the rest mass `m`, a positive number. Defaults to 1.
+        - `speed`: the speed of light `c`, a positive number. Defaults to 1.
 
         **Raises:**
 

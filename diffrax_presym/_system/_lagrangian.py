@@ -17,22 +17,22 @@ from ._split import AbstractSplit
 
 
 class LagrangianSystem(AbstractSystem):
-    r"""A mechanical system with a mass matrix $M(t, q)$: robots, chains, linkages.
+    """A mechanical system with a mass matrix `M(t, q)`: robots, chains, linkages.
 
-    The Lagrangian is $L = v \cdot M(t, q) \, v / 2 - V(t, q)$, and the state of a solve
-    is $(q, p)$, a vector of joint positions and the momenta $p = M(t, q) \, v$. The
-    equations of motion are
+    The Lagrangian is `L = v · M(t, q) v / 2 - V(t, q)`, and the state of a solve is
+    `(q, p)`, a vector of joint positions and the momenta `p = M(t, q) v`. The equations
+    of motion are
 
-    $$q' = v = M^{-1} p, \qquad p' = \partial L / \partial q - C v + f(t, q, v).$$
+    `q' = v = M^-1 p` and `p' = ∂L/∂q - C v + f(t, q, v)`.
 
-    $\partial L / \partial q$ is taken at constant $v$, so that one factorisation of
-    $M$ gives both velocity and force, and no derivative is taken through it.
-    The energy is $E = p \cdot M^{-1} p / 2 + V$.
+    `∂L / ∂q` is taken at constant `v`, so that one factorisation of `M` gives both
+    velocity and force, and no derivative is taken through it. The energy is
+    `E = p · M^-1 p / 2 + V`.
 
-    Not separable: use [`diffrax_presym.PresymplecticGauss`][]. With friction at one
-    rate for all momenta the conformal structure is preserved. Friction per velocity and
-    a `force` are part of the force to the solvers of this package; with either the
-    solvers keep their order and symmetry.
+    Not separable: use `PresymplecticGauss`. With friction at one rate for all momenta
+    the conformal structure is preserved. Friction per velocity and a `force` are part
+    of the force to the solvers of this package; with either the solvers keep their
+    order and symmetry.
 
     A mass matrix that is not positive definite gives a velocity of NaN. Solvers of this
     package check the mass matrix at the end of every step: a solve fails, with a
@@ -71,12 +71,11 @@ class LagrangianSystem(AbstractSystem):
             mass for a position, of moment of inertia for an angle.
         - `potential`: the potential energy, a function `V(t, q, args)` that returns one
             number.
-        - `friction`: a law of friction, or a list: most often
-            [`diffrax_presym.ViscousDamping`][] with coefficients in units of force per
-            velocity (torque per angular velocity for an angle). A damper acts on the
-            angle of its joint: if `q` are angles from the vertical, and `J @ q` those
-            of the joints, write `ViscousDamping(J.T @ jnp.diag(dampers) @ J)`. Defaults
-            to no friction.
+        - `friction`: a law of friction, or a list: most often `ViscousDamping` with
+            coefficients in units of force per velocity (torque per angular velocity for
+            an angle). A damper acts on the angle of its joint: if `q` are angles from
+            the vertical, and `J @ q` those of the joints, write `ViscousDamping(J.T @
+            jnp.diag(dampers) @ J)`. Defaults to no friction.
         - `force`: any further generalised force, a function `f(t, q, v, args)` of the
             velocity `v` that returns an array of shape `(n,)`: a motor, a controller,
             drag. Defaults to none.
@@ -127,7 +126,7 @@ class LagrangianSystem(AbstractSystem):
     def from_velocity(
         self, t: Time, y: tuple[Vector, Vector], args: PyTree = None
     ) -> tuple[Vector, Vector]:
-        """The state `(q, p)`, with $p = M(t, q) v$, of positions and velocities.
+        """The state `(q, p)`, with `p = M(t, q) v`, of positions and velocities.
 
         **Arguments:**
 

@@ -28,14 +28,14 @@ _is_manifold = lambda x: isinstance(x, AbstractManifold)
 
 
 class ManifoldSystem(AbstractSystem):
-    r"""A mechanical system on a manifold whose free motion is known, with friction.
+    """A mechanical system on a manifold whose free motion is known, with friction.
 
     Positions are in ambient coordinates. Drifts are free motions along geodesics, which
     friction at a rate shortens; other friction is composed with them. Kicks are
-    tangential. [`diffrax_presym.Strang`][], [`diffrax_presym.BlanesMoan4`][],
-    [`diffrax_presym.BlanesMoan6`][] and compositions keep their order, and positions
-    stay on the manifold to rounding. Start from `system.project(t0, y0)`. In Diffrax's
-    loop save values between steps by `SaveAt(ts=ts, fn=system.project)`.
+    tangential. `Strang`, `BlanesMoan4`, `BlanesMoan6` and compositions keep their
+    order, and positions stay on the manifold to rounding. Start from
+    `system.project(t0, y0)`. In Diffrax's loop save values between steps by
+    `SaveAt(ts=ts, fn=system.project)`.
 
     !!! example
 
@@ -59,11 +59,11 @@ class ManifoldSystem(AbstractSystem):
     def __init__(self, manifold, potential, friction=None):
         """**Arguments:**
 
-        - `manifold`: where the positions are, such as [`diffrax_presym.Sphere`][]`()`,
-            or a pytree of manifolds for positions of that structure.
+        - `manifold`: where the positions are, such as `Sphere()`, or a pytree of
+            manifolds for positions of that structure.
         - `potential`: the potential energy, a function `V(t, q, args)` that returns a
-            scalar; or a [`diffrax_presym.ForceField`][] of forces on the momenta, and
-            torques along the axes of bodies.
+            scalar; or a `ForceField` of forces on the momenta, and torques along the
+            axes of bodies.
         - `friction`: a law of friction that depends on time alone, or a list. Of a
             `Sphere` or a `Stiefel` one rate. Defaults to none.
 

@@ -32,7 +32,7 @@ class AbstractManifold(eqx.Module):
 
     @abc.abstractmethod
     def pull(self, q: Array, force: Array) -> Array:
-        """The rate of change of the momentum by an ambient force, $-dV/dq$."""
+        """The rate of change of the momentum by an ambient force, `-dV/dq`."""
 
     @abc.abstractmethod
     def project(self, q: Array, p: Array) -> Both:
@@ -41,6 +41,9 @@ class AbstractManifold(eqx.Module):
     def momenta(self, q: tuple[int, ...]) -> tuple[int, ...]:
         """The shape of the momenta of positions of a shape. By default the same."""
         return q
+
+
+AbstractManifold.__init__.__doc__ = "**Arguments:** its fields, if any."
 
 
 class Euclidean(AbstractManifold):
@@ -153,7 +156,7 @@ class Attitude(AbstractManifold):
 
     The free rotation is that of a symmetric body, which is exact, between what remains
     about the first two axes; composed to the order of the scheme. A potential takes the
-    matrix, [`diffrax_presym.rotation_matrix`][]`(q)`.
+    matrix, `rotation_matrix(q)`.
     """
 
     inertia: Float[Array, "*bodies 3"]
@@ -211,7 +214,7 @@ class Attitude(AbstractManifold):
 
 def rotation_matrix(q: Float[Array, "*bodies 4"]) -> Float[Array, "*bodies 3 3"]:
     """The matrix of a quaternion, from the coordinates of a body to those of space: for
-    potentials of a [`diffrax_presym.Attitude`][].
+    potentials of an `Attitude`.
 
     **Arguments:**
 

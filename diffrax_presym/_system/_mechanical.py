@@ -23,32 +23,29 @@ from ._split import AbstractSplit
 
 
 class MechanicalSystem(AbstractSystem):
-    r"""A mechanical system with a kinetic and a potential energy, any friction and any
+    """A mechanical system with a kinetic and a potential energy, any friction and any
     other force,
 
-    $$q' = v = \frac{\partial T}{\partial p}, \qquad
-    p' = -\frac{\partial V}{\partial q} + F_\mathrm{friction} + f(t, q, v).$$
+    `q' = v = ∂T/∂p` and `p' = -∂V/∂q + F_friction + f(t, q, v)`.
 
     The laws of friction, which may be combined in a list:
 
     | friction | law |
     |---|---|
-    | one rate, or one for each degree of freedom | [`diffrax_presym.ConstantDamping`][], [`diffrax_presym.LogDamping`][], [`diffrax_presym.PowerDamping`][], `eta(t)` |
-    | force per velocity: dashpots, a matrix, a magnetic field | [`diffrax_presym.ViscousDamping`][] |
-    | a rate or coefficients that depend on place | [`diffrax_presym.PositionDamping`][], [`diffrax_presym.ViscousDamping`][] |
-    | a power of the speed | [`diffrax_presym.Drag`][] |
+    | one rate, or one for each degree of freedom | `ConstantDamping`, `LogDamping`, `PowerDamping`, `eta(t)` |
+    | force per velocity: dashpots, a matrix, a magnetic field | `ViscousDamping` |
+    | a rate or coefficients that depend on place | `PositionDamping`, `ViscousDamping` |
+    | a power of the speed | `Drag` |
     | any other | `force` |
 
-    The first two are linear, and exact in the drift of a
-    [`diffrax_presym.QuadraticKinetic`][]: no scheme loses its order by them, and in
-    one-step schemes phase volume contracts exactly. With the others use
-    [`diffrax_presym.BlanesMoan4`][] or [`diffrax_presym.BlanesMoan6`][]. A kick by a
-    `force` solves an equation for the momentum alone, to the order of the scheme and
-    symmetric; if the force is too stiff for the step, the solve fails.
+    The first two are linear, and exact in the drift of a `QuadraticKinetic`: no scheme
+    loses its order by them, and in one-step schemes phase volume contracts exactly.
+    With the others use `BlanesMoan4` or `BlanesMoan6`. A kick by a `force` solves an
+    equation for the momentum alone, to the order of the scheme and symmetric; if the
+    force is too stiff for the step, the solve fails.
 
-    For a mass matrix that depends on the positions write
-    [`diffrax_presym.LagrangianSystem`][], for any other energy
-    [`diffrax_presym.Hamiltonian`][].
+    For a mass matrix that depends on the positions write `LagrangianSystem`, for any
+    other energy `Hamiltonian`.
 
     !!! example
 
@@ -74,19 +71,17 @@ class MechanicalSystem(AbstractSystem):
     def __init__(self, kinetic, potential, friction=None, *, force=None):
         """**Arguments:**
 
-        - `kinetic`: the kinetic energy, for example
-            [`diffrax_presym.QuadraticKinetic`][], or a function `T(t, p, args)` that
-            returns a scalar.
+        - `kinetic`: the kinetic energy, for example `QuadraticKinetic`, or a function
+            `T(t, p, args)` that returns a scalar.
         - `potential`: the potential energy, a function `V(t, q, args)` that returns a
-            scalar, a [`diffrax_presym.QuadraticPotential`][], or a
-            [`diffrax_presym.ForceField`][] for a force that has none.
+            scalar, a `QuadraticPotential`, or a `ForceField` for a force that has none.
         - `friction`: a law of friction, or a list of laws that act together. A function
             `eta(t)` is the integral of a rate of damping. Defaults to no friction.
         - `force`: any further force, a function `f(t, q, v, args)` of the velocity `v`,
             of the structure and shape of `q`: a motor, a controller, a contact. It is
             added to that of the potential. Above order 2 it is differentiated by `v` in
             forward mode. Defaults to none. A force that does not depend on the velocity
-            is better part of the potential, or a [`diffrax_presym.ForceField`][].
+            is better part of the potential, or a `ForceField`.
 
         **Raises:**
 

@@ -138,13 +138,12 @@ class PotentialSplit(AbstractSplit):
 
 
 class SharedSplit(AbstractSplit):
-    r"""Of friction at one constant rate: half of it on positions and half on momenta,
+    """Of friction at one constant rate: half of it on positions and half on momenta,
     which leaves a force.
 
-    With $q = e^{-\gamma t / 2} x$ the motion is
-    $M x'' = e^{\gamma t / 2} F + \gamma^2 M x / 4$. The pair is $q$ and
-    $p + \gamma M q / 2$, which are $e^{-\gamma t / 2}$ times $x$ and $M x'$; `enter`
-    and `leave` go from $(q, p)$ to it and back.
+    With `q = exp(-γ t / 2) x` the motion is `M x'' = exp(γ t / 2) F + γ^2 M x / 4`. The
+    pair is `q` and `p + γ M q / 2`, which are `exp(-γ t / 2)` times `x` and `M x'`;
+    `enter` and `leave` go from `(q, p)` to it and back.
     """
 
     kinds: frozenset[str] = eqx.field(static=True)

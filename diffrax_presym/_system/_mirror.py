@@ -14,27 +14,27 @@ from ._kinetic import QuadraticKinetic
 
 
 class AbstractMirrorMap(eqx.Module):
-    r"""A convex function $h$, with $\nabla h$, its inverse $\nabla h^*$ and its domain.
+    """A convex function `h`, with `∇h`, its inverse `∇h^*` and its domain.
 
-    A point $q$ has the mirror image $\nabla h(q)$, to which momenta are added. Methods
-    work relative to a point, because differences of mirror images lose most of their
-    digits in `float32`.
+    A point `q` has the mirror image `∇h(q)`, to which momenta are added. Methods work
+    relative to a point, because differences of mirror images lose most of their digits
+    in `float32`.
     """
 
-    # Whether $\nabla h$ is linear.
+    # Whether `∇h` is linear.
     is_quadratic: eqx.AbstractVar[bool]
 
     @abc.abstractmethod
     def __call__(self, q: PyTree) -> Scalar:
-        """The value $h(q)$, a scalar."""
+        """The value `h(q)`, a scalar."""
 
     @abc.abstractmethod
     def gradient(self, q: PyTree) -> PyTree:
-        r"""The mirror image $\nabla h(q)$."""
+        """The mirror image `∇h(q)`."""
 
     @abc.abstractmethod
     def inverse(self, w: PyTree) -> PyTree:
-        r"""The point $\nabla h^*(w)$ with mirror image $w$."""
+        """The point `∇h^*(w)` with mirror image `w`."""
 
     def contains(self, q: PyTree) -> Bool[Array, ""]:
         """Whether `q` is inside the domain. False if `q` is not finite."""
@@ -44,14 +44,13 @@ class AbstractMirrorMap(eqx.Module):
     # the step of a zero momentum is exactly zero.
 
     def step(self, q: PyTree, p: PyTree) -> PyTree:
-        r"""The mirror step $\nabla h^*(\nabla h(q) + p) - q$; not finite where
-        undefined."""
+        """The mirror step `∇h^*(∇h(q) + p) - q`; not finite where undefined."""
         image = self.gradient(q)
         end, start = self.inverse(tree.sum(image, p)), self.inverse(image)
         return tree.sub(end, start)
 
     def change(self, q: PyTree, dq: PyTree) -> PyTree:
-        r"""The difference $\nabla h(q + dq) - \nabla h(q)$."""
+        """The difference `∇h(q + dq) - ∇h(q)`."""
         return tree.sub(self.gradient(tree.sum(q, dq)), self.gradient(q))
 
     def project(self, p: PyTree) -> PyTree:
@@ -59,8 +58,11 @@ class AbstractMirrorMap(eqx.Module):
         return p
 
 
+AbstractMirrorMap.__init__.__doc__ = "**Arguments:** its fields, if any."
+
+
 class EuclideanMirror(AbstractMirrorMap):
-    r"""The mirror map $h(q) = \tfrac12 \, q \cdot M q$, with a linear $\nabla h$.
+    """The mirror map `h(q) = q · M q / 2`, with a linear `∇h`.
 
     Bregman dynamics is then separable, the quadratic case of the paper, and every
     one-step scheme for separable energies applies.
@@ -72,8 +74,8 @@ class EuclideanMirror(AbstractMirrorMap):
     def __init__(self, mass=None):
         """**Arguments:**
 
-        - `mass`: the mass matrix, in any form of [`diffrax_presym.QuadraticKinetic`][].
-            Defaults to `None`, unit mass.
+        - `mass`: the mass matrix, in any form of `QuadraticKinetic`. Defaults to
+            `None`, unit mass.
 
         **Raises:**
 
@@ -99,13 +101,13 @@ class EuclideanMirror(AbstractMirrorMap):
 
 
 class EntropyMirror(AbstractMirrorMap):
-    r"""The negative entropy $h(q) = \sum_i q_i \log q_i$, for positive numbers.
+    """The negative entropy `h(q) = Σ_i q_i log q_i`, for positive numbers.
 
     Mirror descent with it is multiplicative. With `simplex=True` its domain is the
-    probability simplex, where $\nabla h^*$ is the softmax: positions stay positive and
-    sum to one, to rounding, without projection. A constant added to all momenta of a
-    simplex has no effect. It is removed from every force, so that the sum of momenta
-    that start at rest remains zero.
+    probability simplex, where `∇h^*` is the softmax: positions stay positive and sum to
+    one, to rounding, without projection. A constant added to all momenta of a simplex
+    has no effect. It is removed from every force, so that the sum of momenta that start
+    at rest remains zero.
     """
 
     simplex: bool = eqx.field(static=True)
@@ -153,10 +155,10 @@ class EntropyMirror(AbstractMirrorMap):
 
 
 class MirrorMap(AbstractMirrorMap):
-    r"""A mirror map given by a function $h$.
+    """A mirror map given by a function `h`.
 
-    $\nabla h$ is by automatic differentiation. Where its inverse has no closed form,
-    let `inverse` find a root with `optimistix.root_find`. Its domain is where $h$ is
+    `∇h` is by automatic differentiation. Where its inverse has no closed form, let
+    `inverse` find a root with `optimistix.root_find`. Its domain is where `h` is
     finite.
     """
 
@@ -165,10 +167,10 @@ class MirrorMap(AbstractMirrorMap):
     inverse_fn: Callable
 
     def __init__(self, h, inverse):
-        r"""**Arguments:**
+        """**Arguments:**
 
         - `h`: a strictly convex function `h(q)` that returns a scalar.
-        - `inverse`: the inverse $\nabla h^*$ of the gradient, a function `inverse(w)`.
+        - `inverse`: the inverse `∇h^*` of the gradient, a function `inverse(w)`.
 
         **Raises:**
 

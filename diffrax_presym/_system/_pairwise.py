@@ -61,15 +61,15 @@ class _PairwisePotential(eqx.Module):
 
 
 def pairwise_potential(fn: Callable, masses=None, box=None) -> Callable:
-    r"""The potential of particles that interact in pairs,
-    $V(t, q) = \sum_{i < j} m_i m_j \, f(t, |q_i - q_j|)$.
+    """The potential of particles that interact in pairs, `V(t, q) = Σ_{i < j} m_i m_j
+    f(t, |q_i - q_j|)`.
 
-    For planets, molecules and other pairs of particles, as the `potential` of a
-    system. Positions are an array of shape `(n, dim)`. Its force is computed from
-    the matrix of all distances, without the scattered additions that JAX makes of pairs
-    written with index arrays. Measured on a CPU, it takes 0.3 to 0.8 times as long as
-    these for 6 to 50 particles, also in a batch of them; not for very many particles,
-    as the memory grows with $n^2$.
+    For planets, molecules and other pairs of particles, as the `potential` of a system.
+    Positions are an array of shape `(n, dim)`. Its force is computed from the matrix of
+    all distances, without the scattered additions that JAX makes of pairs written with
+    index arrays. Measured on a CPU, it takes 0.3 to 0.8 times as long as these for 6 to
+    50 particles, also in a batch of them; not for very many particles, as the memory
+    grows with `n^2`.
 
     !!! example
 

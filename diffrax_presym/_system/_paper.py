@@ -18,33 +18,29 @@ from ._mechanical import MechanicalSystem
 
 
 def DissipativeHamiltonian(kinetic, potential, eta1, eta2) -> MechanicalSystem:
-    r"""The general family $H = e^{-\eta_1(t)} T(t, P) + e^{\eta_2(t)} f(t, q)$.
+    """The general family `H = exp(-η_1(t)) T(t, P) + exp(η_2(t)) f(t, q)`.
 
-    Equation (gen_ham) of França, Jordan and Vidal (2021), where $P$ is the canonical
-    momentum. The log scale is $\eta_2$, so the state holds
-    $p = e^{-\eta_2(t)} P$ and the energy is
-    $E = e^{-\eta_1 - \eta_2} T(t, e^{\eta_2} p) + f(t, q)$. For
-    [`diffrax_presym.QuadraticKinetic`][] that is $e^{\eta_2 - \eta_1} T(p) + f$, and
-    with $\eta_1 = \eta_2$ the same system as
-    [`diffrax_presym.MechanicalSystem`][]`(T, f, eta1)`.
+    Equation (gen_ham) of França, Jordan and Vidal (2021), where `P` is the canonical
+    momentum. The log scale is `η_2`, so the state holds `p = exp(-η_2(t)) P` and the
+    energy is `E = exp(-η_1 - η_2) T(t, exp(η_2) p) + f(t, q)`. For `QuadraticKinetic`
+    that is `exp(η_2 - η_1) T(p) + f`, and with `η_1 = η_2` the same system as
+    `MechanicalSystem(T, f, eta1)`.
 
-    The kinetic energies of this package do not evaluate the exponential of $\eta_2$
-    itself. A plain function does, and overflows in `float32` once $2 \eta_2$ exceeds
-    88.
+    The kinetic energies of this package do not evaluate the exponential of `η_2`
+    itself. A plain function does, and overflows in `float32` once `2 η_2` exceeds 88.
 
     **Arguments:**
 
-    - `kinetic`: the kinetic energy $T$ as a function of the *canonical* momentum: for
-        example [`diffrax_presym.QuadraticKinetic`][], or a function `T(t, P, args)`.
-        One that depends on `q` too is the energy $E$ of a
-        [`diffrax_presym.Hamiltonian`][].
-    - `potential`: the function $f$ to minimise, or potential energy, a function
-        `f(t, q, args)` that returns a scalar.
+    - `kinetic`: the kinetic energy `T` as a function of the *canonical* momentum: for
+        example `QuadraticKinetic`, or a function `T(t, P, args)`. One that depends on
+        `q` too is the energy `E` of a `Hamiltonian`.
+    - `potential`: the function `f` to minimise, or potential energy, a function `f(t,
+        q, args)` that returns a scalar.
     - `eta1`, `eta2`: damping laws or functions of time.
 
     **Returns:**
 
-    A [`diffrax_presym.MechanicalSystem`][].
+    A `MechanicalSystem`.
 
     **Raises:**
 

@@ -30,15 +30,18 @@ class AbstractPotential(eqx.Module):
 
     @abc.abstractmethod
     def force(self, t: Time, q: PyTree, args: PyTree = None) -> PyTree:
-        r"""The force $-\partial V / \partial q$."""
+        """The force `-∂V / ∂q`."""
+
+
+AbstractPotential.__init__.__doc__ = "**Arguments:** its fields, if any."
 
 
 class QuadraticPotential(AbstractPotential):
-    r"""The potential energy $V(q) = \tfrac12 \, q \cdot K q$ of linear springs.
+    """The potential energy `V(q) = q · K q / 2` of linear springs.
 
     It tells solvers that the force is linear. Runge--Kutta--Nyström splittings then
     accept any kinetic energy, by swapping the roles of positions and momenta, and the
-    force is one product with $K$.
+    force is one product with `K`.
     """
 
     stiffness: PyTree[Inexact[Array, "..."]] | lx.AbstractLinearOperator | None
@@ -47,7 +50,7 @@ class QuadraticPotential(AbstractPotential):
     def __init__(self, stiffness=None):
         """**Arguments:**
 
-        - `stiffness`: the stiffness $K$, of any sign, in any of these forms. Defaults
+        - `stiffness`: the stiffness `K`, of any sign, in any of these forms. Defaults
             to `None`.
             - `None`: unit stiffness.
             - A number: the same stiffness for every degree of freedom.
@@ -80,10 +83,10 @@ class QuadraticPotential(AbstractPotential):
 class ForceField(AbstractPotential):
     """A force that depends on time and place, without a potential energy.
 
-    As the potential of a [`diffrax_presym.MechanicalSystem`][]: for measured force
-    fields, stochastic gradients, forces that are not conservative, or potentials too
-    expensive to compute. Every scheme accepts it, but is (pre)symplectic only if the
-    force derives from an energy.
+    As the potential of a `MechanicalSystem`: for measured force fields, stochastic
+    gradients, forces that are not conservative, or potentials too expensive to compute.
+    Every scheme accepts it, but is (pre)symplectic only if the force derives from an
+    energy.
     """
 
     fn: Callable

@@ -9,13 +9,12 @@ from .._numbers import cast_to, Scalar, Time
 
 
 class Scaling(eqx.Module):
-    r"""The functions $\alpha$, $\beta$ and $\gamma$ of time in Bregman dynamics.
+    """The functions `α`, `β` and `γ` of time in Bregman dynamics.
 
-    They satisfy $\dot\gamma = e^\alpha$, from which $\alpha$ follows, and
-    $\dot\beta \le e^\alpha$, equation (scaling) of França, Jordan and Vidal (2021). The
-    objective then converges like $e^{-\beta}$, best with $\beta = \gamma$ but for a
-    constant: [`diffrax_presym.PolynomialScaling`][] and
-    [`diffrax_presym.ExponentialScaling`][].
+    They satisfy `γ' = exp(α)`, from which `α` follows, and `β' ≤ exp(α)`, equation
+    (scaling) of França, Jordan and Vidal (2021). The objective then converges like
+    `exp(-β)`, best with `β = γ` but for a constant: `PolynomialScaling` and
+    `ExponentialScaling`.
 
     The conditions are checked at the end of every step; a solve fails if they do not
     hold.
@@ -26,12 +25,12 @@ class Scaling(eqx.Module):
     C: Scalar
 
     def __init__(self, gamma, beta=None, C: ArrayLike = 1.0):
-        r"""**Arguments:**
+        """**Arguments:**
 
-        - `gamma`: $\gamma$, a damping law such as [`diffrax_presym.LogDamping`][], or
-            an increasing function of time.
-        - `beta`: $\beta$, a function of time. Defaults to `gamma`.
-        - `C`: the strength of the objective, a positive number: $\log C$ is added to
+        - `gamma`: `γ`, a damping law such as `LogDamping`, or an increasing function of
+            time.
+        - `beta`: `β`, a function of time. Defaults to `gamma`.
+        - `C`: the strength of the objective, a positive number: `log C` is added to
             `beta`. Defaults to 1.
 
         **Raises:**
@@ -43,11 +42,11 @@ class Scaling(eqx.Module):
         self.C = as_positive(C, "`C`")
 
     def rate(self, t: Time) -> Scalar:
-        r"""The rate $e^{\alpha(t)}$ at which positions move along the mirror step."""
+        """The rate `exp(α(t))` at which positions move along the mirror step."""
         return self.gamma.rate(t)
 
     def strength(self, t: Time) -> Scalar:
-        r"""The strength $e^{\alpha(t) + \beta(t)}$ of the objective."""
+        """The strength `exp(α(t) + β(t))` of the objective."""
         rate = self.rate(t)
         beta = self.gamma(t) if self.beta is None else self.beta(t)
         return cast_to(self.C, rate) * rate * jnp.exp(beta)
@@ -71,12 +70,12 @@ def _as_damping(law, name: str) -> Damping:
 
 
 def PolynomialScaling(c, C: ArrayLike = 1.0) -> Scaling:
-    r"""$\alpha = \log (c / t)$, $\beta = c \log t + \log C$ and $\gamma = c \log t$.
+    """`α = log (c / t)`, `β = c log t + log C` and `γ = c log t`.
 
-    The objective converges like $t^{-c}$, equation (scaling2) of França, Jordan and
-    Vidal (2021); with $c = 2$ and $C = 1/4$ the motion is that of Nesterov's method.
-    Time must be positive. The frequency of the motion grows like $t^{c/2 - 1}$, so that
-    for $c > 2$ any explicit scheme of fixed step eventually becomes unstable.
+    The objective converges like `t^-c`, equation (scaling2) of França, Jordan and Vidal
+    (2021); with `c = 2` and `C = 1/4` the motion is that of Nesterov's method. Time
+    must be positive. The frequency of the motion grows like `t^(c/2 - 1)`, so that for
+    `c > 2` any explicit scheme of fixed step eventually becomes unstable.
 
     **Arguments:**
 
@@ -92,9 +91,9 @@ def PolynomialScaling(c, C: ArrayLike = 1.0) -> Scaling:
 
 
 def ExponentialScaling(c, C: ArrayLike = 1.0) -> Scaling:
-    r"""$\alpha = \log c$, $\beta = c t + \log C$ and $\gamma = c t$.
+    """`α = log c`, `β = c t + log C` and `γ = c t`.
 
-    The objective converges like $e^{-ct}$, equation (scaling1) of França, Jordan and
+    The objective converges like `exp(-ct)`, equation (scaling1) of França, Jordan and
     Vidal (2021). So does the square of the largest stable step of an explicit scheme.
 
     **Arguments:**

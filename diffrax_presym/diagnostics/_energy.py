@@ -20,7 +20,7 @@ _MAX_STEPS = 100_000
 
 
 def energy(system: AbstractSystem, ts: Times, ys: State, args: PyTree = None) -> Times:
-    r"""The mechanical energy $E(t, q, p)$ at each saved time.
+    """The mechanical energy `E(t, q, p)` at each saved time.
 
     **Arguments:**
 
@@ -39,23 +39,22 @@ def energy(system: AbstractSystem, ts: Times, ys: State, args: PyTree = None) ->
 def energy_error(
     system: AbstractSystem, ts: Times, ys: State, args: PyTree = None
 ) -> Times:
-    r"""The error of the energy balance at each saved time.
+    """The error of the energy balance at each saved time.
 
     Along the exact motion the extended Hamiltonian is constant: energy changes only by
     friction, by other forces, and where it depends on time,
 
-    $$E(t) - E(t_0) = \int_{t_0}^t \Big( \frac{\partial E}{\partial t}
-    + v \cdot F \Big) \, \mathrm d t,$$
+    `E(t) - E(t0) = ∫ (∂E/∂t + v · F) dt`,
 
-    where $v$ is the velocity and $F$ the force that has no potential:
-    $-\dot \eta \, p$ for a damping law. The error is the left side minus the right. The
-    integral is along the exact motion from each saved state to the next time, by
-    `diffrax.Dopri8` to rounding, so that the error is that of the solution alone. It is
-    NaN where that fails.
+    where `v` is the velocity and `F` the force that has no potential: `-η' p` for a
+    damping law. The error is the left side minus the right. The integral is along the
+    exact motion from each saved state to the next time, by `diffrax.Dopri8` to
+    rounding, so that the error is that of the solution alone. It is NaN where that
+    fails.
 
     **Arguments:**
 
-    As [`diffrax_presym.diagnostics.energy`][].
+    As `diagnostics.energy`.
     """
     done = _integral(_power, system, ts, ys, args)
     balance = energy(system, ts, ys, args)
@@ -65,17 +64,17 @@ def energy_error(
 def power_lost(
     system: AbstractSystem, ts: Times, ys: State, args: PyTree = None
 ) -> Times:
-    r"""The power lost to friction at each saved time, $-v \cdot F$ with the velocity
-    $v$ and the force $F$ of all friction: $v \cdot C v$ for viscous friction.
+    """The power lost to friction at each saved time, `-v · F` with the velocity `v`
+    and the force `F` of all friction: `v · C v` for viscous friction.
 
     It follows the saved momenta. Where friction over a step is of the order of one or
-    more, those of [`diffrax_presym.Strang`][], `PresymplecticLeapfrog` and
-    `PresymplecticEuler` are not resolved, and the power is wrong by the square of their
-    factor, which is in their docstrings.
+    more, those of `Strang`, `PresymplecticLeapfrog` and `PresymplecticEuler` are not
+    resolved, and the power is wrong by the square of their factor, which is in their
+    docstrings.
 
     **Arguments:**
 
-    As [`diffrax_presym.diagnostics.energy`][].
+    As `diagnostics.energy`.
     """
     return _at_each(_power_lost, system, ts, ys, args)
 
@@ -84,15 +83,15 @@ def energy_lost(
     system: AbstractSystem, ts: Times, ys: State, args: PyTree = None
 ) -> Times:
     """The energy lost to friction up to each saved time, the integral of
-    [`diffrax_presym.diagnostics.power_lost`][].
+    `diagnostics.power_lost`.
 
     Along the exact motion from each saved state to the next time, so that a momentum
     that a coarse scheme does not resolve counts once for each saved time: see
-    [`diffrax_presym.diagnostics.power_lost`][].
+    `diagnostics.power_lost`.
 
     **Arguments:**
 
-    As [`diffrax_presym.diagnostics.energy`][].
+    As `diagnostics.energy`.
     """
     return _integral(_power_lost, system, ts, ys, args)
 

@@ -119,7 +119,7 @@ def plot_work_precision(result: WorkPrecision, axes: Any = None):
 
     **Arguments:**
 
-    - `result`: of [`diffrax_presym.diagnostics.work_precision`][].
+    - `result`: of `diagnostics.work_precision`.
     - `axes`: axes of Matplotlib. Defaults to those of a new figure.
 
     **Returns:**

@@ -23,14 +23,14 @@ def structure_defect(
     y: State,
     args: PyTree = None,
 ) -> Inexact[Array, ""]:
-    r"""The error of conformal symplecticity of one step.
+    """The error of conformal symplecticity of one step.
 
-    The largest entry of $J^T \Omega J - e^{\eta(t_0) - \eta(t_1)} \Omega$, where $J$ is
-    the Jacobian of the step: zero to rounding for the one-step schemes of this package
-    ([`diffrax_presym.PresymplecticGauss`][] while friction over a step is at most one).
-    Those with two copies of the system are conformally symplectic in the doubled phase
-    space; their defect in `y` alone is small but not zero. Only for systems whose
-    friction is one rate of damping, without constraints.
+    The largest entry of `J^T Ω J - exp(η(t0) - η(t1)) Ω`, where `J` is the Jacobian of
+    the step: zero to rounding for the one-step schemes of this package
+    (`PresymplecticGauss` while friction over a step is at most one). Those with two
+    copies of the system are conformally symplectic in the doubled phase space; their
+    defect in `y` alone is small but not zero. Only for systems whose friction is one
+    rate of damping, without constraints.
 
     **Arguments:**
 

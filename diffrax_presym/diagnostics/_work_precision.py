@@ -21,7 +21,7 @@ Solve = Callable[[Any], Any]
 
 
 class WorkPrecisionRun(NamedTuple):
-    """One solve of [`diffrax_presym.diagnostics.work_precision`][].
+    """One solve of `diagnostics.work_precision`.
 
     **Attributes:**
 
@@ -41,12 +41,12 @@ class WorkPrecisionRun(NamedTuple):
 
 
 class WorkPrecision(NamedTuple):
-    """The measurements of [`diffrax_presym.diagnostics.work_precision`][].
+    """The measurements of `diagnostics.work_precision`.
 
     **Attributes:**
 
-    - `runs`: a [`diffrax_presym.diagnostics.WorkPrecisionRun`][] for each solve and
-        each of its steps or tolerances.
+    - `runs`: a `diagnostics.WorkPrecisionRun` for each solve and each of its steps or
+        tolerances.
     - `reference`: the name of the solve whose finest solution the errors refer to.
     """
 
@@ -118,7 +118,7 @@ def work_precision(
     **Arguments:**
 
     - `solves`: names, and functions of the step `dt0` that return a `diffrax.Solution`,
-        as for [`diffrax_presym.choose_step`][]. They should be jitted.
+        as for `choose_step`. They should be jitted.
     - `t0`, `t1`: the start and the end of the solves.
     - `rtol`, `atol`: the tolerance, for each entry of what is saved.
     - `adaptive`: names, and functions of a relative tolerance that return a
@@ -129,8 +129,8 @@ def work_precision(
 
     **Returns:**
 
-    A [`diffrax_presym.diagnostics.WorkPrecision`][], which prints as a table;
-    [`diffrax_presym.diagnostics.plot_work_precision`][] draws it.
+    A `diagnostics.WorkPrecision`, which prints as a table;
+    `diagnostics.plot_work_precision` draws it.
 
     **Raises:**
 
