@@ -1,5 +1,7 @@
 """Events: their times, derivatives of these, and continuation after events."""
 
+from typing import Any
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -329,15 +331,16 @@ def above_the_floor(t, y, args, **kwargs):
 @eqx.filter_jit
 def fly(t0, t1, y0, event=True, **kwargs):
     """Above a floor at a tenth of the height of the start, by variable steps."""
-    event = dfx.Event(above_the_floor, FINDER, direction=False) if event else None
+    floor = dfx.Event(above_the_floor, FINDER, direction=False) if event else None
+    options: Any = {"dt0": None} | kwargs
     return dfx.diffeqsolve(
         *(PLANET, dps.BlanesMoanRKN6(), t0, t1),
         y0=y0,
         stepsize_controller=dps.StepDensityController(0.05, PLANET),
-        event=event,
+        event=floor,
         saveat=dfx.SaveAt(t0=True, steps=True),
         max_steps=256,
-        **({"dt0": None} | kwargs),
+        **options,
     )
 
 
@@ -346,7 +349,7 @@ def test_variable_steps_are_reversible_between_events():
     each goes back to its start by the same steps, and no flight loses energy."""
     t, y, energies = jnp.array(0.0), (jnp.array([0.0, 1.0]), jnp.array([0.2, 0.0])), []
     for _ in range(10):
-        sol = fly(t, t + 20.0, y)
+        sol: Any = fly(t, t + 20.0, y)
         assert sol.result == dfx.RESULTS.event_occurred
         ts, *ys = every(sol)
         h = np.diff(ts)[:-1]  # The last one ends at the event, inside of a step.
