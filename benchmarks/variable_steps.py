@@ -72,7 +72,7 @@ def kepler(quick):
     for e in (0.9, 0.99, 0.999):
         y0 = tuple(map(jnp.asarray, eccentric(e, rng.uniform(0, 2 * np.pi))))
         ts = jnp.asarray(np.sort(rng.uniform(0, 2 * np.pi * orbits, 2000)))
-        energy = lambda t, y, args: ATTRACTION.energy(t, *y, args) + 0.5
+        energy = lambda t, y, args: ATTRACTION.energy(t, y[0], y[1], args) + 0.5
         saveat = dfx.SaveAt(ts=ts, fn=energy)
         for name, epsilon in (("TunedRKN6", 0.3), ("BlanesMoanRKN4", 0.1)):
             scheme, times = SCHEMES[name].solver, (0.0, 2 * np.pi * orbits)
@@ -88,7 +88,7 @@ def kepler(quick):
     return out
 
 
-MASSES, PLACE = np.array([3.0, 4.0, 5.0]), ("xyz", "vxyz")
+MASSES = np.array([3.0, 4.0, 5.0])
 
 
 def found(module):
@@ -99,13 +99,34 @@ def simulation(masses, q, v, epsilon):
     """Bodies in the plane, for IAS15."""
     import rebound  # pyright: ignore[reportMissingImports]
 
-    sim = rebound.Simulation()
+    sim: Any = rebound.Simulation()
     for m, (x, y), (vx, vy) in zip(masses, q, v, strict=True):
         sim.add(m=m, x=float(x), y=float(y), vx=float(vx), vy=float(vy))
     sim.integrator = "ias15"
     # Of REBOUND 5, and of those before.
     getattr(sim, "ri_ias15", sim.integrator).epsilon = epsilon
     return sim
+
+
+def to_sixty(system, y0, name, parameter):
+    """Positions and momenta at t = 60, and the number of steps."""
+    if name == "IAS15":
+        sim = simulation(MASSES, y0[0], y0[1], parameter)
+        sim.integrate(60.0)
+        q = np.array([[body.x, body.y] for body in sim.particles])
+        v = np.array([[body.vx, body.vy] for body in sim.particles])
+        return q, MASSES[:, None] * v, sim.steps_done
+    if name == "Dopri8":
+        controller = dfx.PIDController(rtol=parameter, atol=parameter)
+        at = system, dfx.Dopri8(), 0.0, 60.0, None, y0
+        run = partial(solve, *at, controller=controller, max_steps=10**6)
+    else:
+        scheme = dps.BlanesCasasRKN8()
+        scheme = dps.Compensated(scheme) if "Compensated" in name else scheme
+        run = partial(variable, system, scheme, (0.0, 60.0), y0, parameter)
+    sol: Any = eqx.filter_jit(run)()
+    assert sol.result == dfx.RESULTS.successful, sol.result
+    return *map(np.asarray, last(sol)), int(sol.stats["num_steps"])
 
 
 def burrau(quick):
@@ -126,24 +147,7 @@ def burrau(quick):
     runs += [("the same, Compensated", x) for x in epsilons]
     runs += [("IAS15", 1e-9), ("IAS15", 1e-12)] if found("rebound") else []
     for name, parameter in runs:
-        if name == "Dopri8":
-            options = dict(rtol=parameter, atol=parameter)
-            options = dict(controller=dfx.PIDController(**options), max_steps=10**6)
-            sol = eqx.filter_jit(solve)(
-                system, dfx.Dopri8(), 0.0, 60.0, None, y0, **options
-            )
-        elif name == "IAS15":
-            sim = simulation(MASSES, y0[0], y0[1], parameter)
-            sim.integrate(60.0)
-            q, v = (np.array([getattr(b, x)[:2] for b in sim.particles]) for x in PLACE)
-            p, steps = MASSES[:, None] * v, sim.steps_done
-        else:
-            scheme = dps.BlanesCasasRKN8()
-            scheme = dps.Compensated(scheme) if "Compensated" in name else scheme
-            sol = eqx.filter_jit(variable)(system, scheme, (0.0, 60.0), y0, parameter)
-        if name != "IAS15":
-            assert sol.result == dfx.RESULTS.successful, sol.result
-            (q, p), steps = map(np.asarray, last(sol)), int(sol.stats["num_steps"])
+        q, p, steps = to_sixty(system, y0, name, parameter)
         drift = abs(float(system.energy(0.0, q, p)) - float(system.energy(0.0, *y0)))
         escaping = int(np.argmax(np.linalg.norm(q, axis=1)))
         a, b = (k for k in range(3) if k != escaping)
@@ -191,7 +195,7 @@ def orbit():
 
 def densities(name):
     """The time scale as a user writes it."""
-    stars = pleiades().distances
+    stars: Any = pleiades().distances
     moons = lambda t, q: (restricted(q, t)[0] ** 3, restricted(q, t)[1] ** 3 / MOON)
     return {
         "Pleiades": lambda t, y, args: jnp.sum(stars(y[0]) ** -3) ** -0.5,
@@ -370,7 +374,8 @@ def gradients(quick):
         )
         times = 0.0, jnp.array(200 * np.pi)
         sol = variable(ATTRACTION, dps.TunedRKN6(), times, start, 0.2)
-        return ATTRACTION.energy(0.0, *last(sol), None) + 0.5, sol.stats["num_steps"]
+        q, p = last(sol)
+        return ATTRACTION.energy(0.0, q, p, None) + 0.5, sol.stats["num_steps"]
 
     alone, batch = jax.jit(energy_error), jax.jit(jax.vmap(energy_error))
     errors, steps = batch(es)
