@@ -50,8 +50,8 @@ ATTRACTION = mechanics(lambda t, q, args: -1 / jnp.linalg.norm(q))
 def variable(system, solver, times, y0, epsilon, density=None, **options) -> Any:
     """A solve with variable steps, in the loop of the package."""
     controller = dps.StepDensityController(epsilon, density or system)
-    options = {"adjoint": dps.FixedStepAdjoint()} | options
-    return solve(system, solver, *times, None, y0, controller=controller, **options)
+    more: Any = {"adjoint": dps.FixedStepAdjoint()} | options
+    return solve(system, solver, *times, None, y0, controller=controller, **more)
 
 
 def eccentric(e, anomaly=0.0):
@@ -104,7 +104,8 @@ def simulation(masses, q, v, epsilon):
         sim.add(m=m, x=float(x), y=float(y), vx=float(vx), vy=float(vy))
     sim.integrator = "ias15"
     # Of REBOUND 5, and of those before.
-    getattr(sim, "ri_ias15", sim.integrator).epsilon = epsilon
+    settings: Any = getattr(sim, "ri_ias15", sim.integrator)
+    settings.epsilon = epsilon
     return sim
 
 
