@@ -128,6 +128,7 @@ def test_a_mass_matrix_that_is_not_positive_and_symmetric_is_a_result(mass, n):
     assert sol.result != dfx.RESULTS.successful
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("n", SIZES)
 def test_velocities_and_their_derivatives(n):
     x = np.random.default_rng(n).standard_normal((n + 3, n))
