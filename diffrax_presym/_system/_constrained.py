@@ -3,31 +3,28 @@
 from collections.abc import Callable
 from typing import ClassVar
 
-import diffrax as dfx
 import equinox as eqx
 import jax
-import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 from .. import _tree as tree
 from .._checks import check_callable, describe
-from .._compositions import lengths
 from .._friction._base import AbstractFriction, Mechanics
 from .._numbers import as_time, Scalar, State, Time
-from .._results import CONSTRAINT_NOT_SOLVED, NOT_REVERSIBLE, SUCCESSFUL
 from ._base import AbstractSystem, P, Q
-from ._bound import System
+from ._constrained_split import ConstrainedSplit
 from ._kinetic import QuadraticKinetic
+from ._manifold import ManifoldSystem
 from ._mechanical import MechanicalSystem
 from ._multipliers import find_root, is_regular, LinearMap, Multipliers, solve
 from ._split import AbstractSplit
 
 
 class ConstrainedSystem(AbstractSystem):
-    """A mechanical system with holonomic constraints `g(t, q) = 0`,
+    """A mechanical system, or bodies, with holonomic constraints `g(t, q) = 0`,
 
     `q' = M^-1 p` and `p' = F - Γ p - G^T λ` with `G = ∂g/∂q`,
 
@@ -57,7 +54,7 @@ class ConstrainedSystem(AbstractSystem):
         ```
     """
 
-    system: MechanicalSystem
+    system: MechanicalSystem | ManifoldSystem
     constraint: Callable
     linear_solver: lx.AbstractLinearSolver | None
     check_inverse: bool = eqx.field(static=True)
@@ -66,7 +63,7 @@ class ConstrainedSystem(AbstractSystem):
 
     def __init__(
         self,
-        system: MechanicalSystem,
+        system: MechanicalSystem | ManifoldSystem,
         constraint: Callable,
         *,
         linear_solver: lx.AbstractLinearSolver | None = None,
@@ -75,7 +72,8 @@ class ConstrainedSystem(AbstractSystem):
         """**Arguments:**
 
         - `system`: a `MechanicalSystem` with a quadratic kinetic energy, any friction,
-            and forces that do not depend on the velocity otherwise.
+            and forces that do not depend on the velocity otherwise; or a
+            `ManifoldSystem`, such as rigid bodies that are joined.
         - `constraint`: a function `g(t, q, args)` that returns an array, zero where the
             constraints hold, or a scalar.
         - `linear_solver`: a Lineax solver for the multipliers. Defaults to `None`, by
@@ -91,14 +89,16 @@ class ConstrainedSystem(AbstractSystem):
         a force that is not supported, and when the solve is traced if the constraint
         returns something else. A solve from a state that is off the constraint fails.
         """
-        if not isinstance(system, MechanicalSystem):
+        if not isinstance(system, MechanicalSystem | ManifoldSystem):
             raise ValueError(
-                "`ConstrainedSystem(system, constraint)` needs a `MechanicalSystem`, "
-                f"but got {type(system).__name__}. Write the constraint in Cartesian "
-                "coordinates, in which the mass is constant."
+                "`ConstrainedSystem(system, constraint)` needs a `MechanicalSystem` or "
+                f"a `ManifoldSystem`, but got {type(system).__name__}. Write the "
+                "constraint in Cartesian coordinates, in which the mass is constant."
             )
-        forced = system.external is not None
-        if forced or not isinstance(system.kinetic, QuadraticKinetic):
+        if isinstance(system, MechanicalSystem) and (
+            system.external is not None
+            or not isinstance(system.kinetic, QuadraticKinetic)
+        ):
             raise ValueError(
                 "`ConstrainedSystem` needs a mass, `QuadraticKinetic(mass)`, and no "
                 "`force=f` that depends on the velocity. Write a force of time and "
@@ -122,6 +122,9 @@ class ConstrainedSystem(AbstractSystem):
     @property
     def mechanics(self) -> Mechanics:
         return self.system.mechanics
+
+    def check_state(self, y: PyTree) -> None:
+        self.system.check_state(y)
 
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         return self.system.energy(t, q, p, args)
@@ -157,6 +160,9 @@ class ConstrainedSystem(AbstractSystem):
     def normal(self, t: Time, q: Q, args: PyTree) -> Callable[[Multipliers], P]:
         """The map from multipliers to momenta, `G^T`."""
         pull = jax.vjp(lambda q: self.value(t, q, args), q)[1]
+        if isinstance(self.system, ManifoldSystem):
+            to_momentum = self.system.to_momentum
+            return lambda x: to_momentum(q, pull(x)[0])
         return lambda x: pull(x)[0]
 
     def _matrix(self, t: Time, q: Q, args: PyTree) -> LinearMap:
@@ -197,9 +203,11 @@ class ConstrainedSystem(AbstractSystem):
         return self.velocity_and_force(t, q, p, args)[1]
 
     def violation(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
-        """The largest entry of the constraints and of their rates of change."""
-        t = as_time(t)
-        return tree.largest([self.value(t, q, args), self.rate(t, q, p, args)])
+        """The largest entry of the constraints and of their rates of change, or by how
+        much the state is off the manifold of the system."""
+        t, other = as_time(t), self.system.violation(t, q, p, args)
+        both = [self.value(t, q, args), self.rate(t, q, p, args)]
+        return tree.largest(both if other is None else [*both, other])
 
     @eqx.filter_jit  # Outside of a solve, it would be compiled again by each call.
     def project(self, t: Time, y: State, args: PyTree = None) -> State:
@@ -211,10 +219,14 @@ class ConstrainedSystem(AbstractSystem):
         `RuntimeError` if the constraints are redundant there, or the positions are too
         far from them.
         """
-        t, (q, p) = as_time(t), y
         self.check_state(y)
+        t, (q, p) = as_time(t), self.system.project(t, y, args)
         normal = self.normal(t, q, args)
-        moved = lambda x: tree.sub(q, self.velocity(t, q, normal(x), args))
+
+        def moved(x: Multipliers) -> Q:
+            change = self.velocity(t, q, normal(x), args)
+            return self.system.project(t, (tree.sub(q, change), p), args)[0]
+
         zero = jnp.zeros_like(self.value(t, q, args))
         small = self.is_small(t, q, tree.largest(q), args)
         regular = is_regular(self._matrix(t, q, args), zero, self.linear_solver)
@@ -222,6 +234,7 @@ class ConstrainedSystem(AbstractSystem):
         x, found = find_root(miss, zero, small, self.linear_solver)
         q = eqx.error_if(moved(x), ~regular, _REDUNDANT)
         q = eqx.error_if(q, ~found, _TOO_FAR)
+        q, p = self.system.project(t, (q, p), args)
         return q, tree.sum(p, self.to_tangent(t, q, p, args))
 
 
@@ -233,106 +246,3 @@ _TOO_FAR = (
     "`project` did not find positions that satisfy the constraints. Start nearer to "
     "them."
 )
-
-
-def _free(system: System) -> System:
-    """The system without constraints."""
-    return eqx.tree_at(lambda x: x.term, system, system.term.system)
-
-
-class ConstrainedSplit(AbstractSplit):
-    """The drift and the kick of a split, both on the constraint.
-
-    A drift starts with a momentum along the normals, so that it ends on the constraint.
-    It is symmetric, of second order, and composed to the order that is needed.
-    """
-
-    base: AbstractSplit
-    kinds: ClassVar[frozenset[str]] = frozenset({"any"})
-
-    def prepare(self, system, t, h, order) -> PyTree:
-        free, h = _free(system), lengths(order, h)
-        starts = t + jnp.cumsum(h) - h
-        prepare = jax.vmap(lambda t, h: self.base.prepare(free, t, h, order))
-        back = prepare(starts + h, -h) if system.term.check_inverse else None
-        return h, prepare(starts, h), back
-
-    def drift(self, system, t, h, data, y) -> State:
-        return self.attempt(system, t, h, data, y)[0]
-
-    def attempt(self, system, t, h, data, y) -> tuple[State, dfx.RESULTS]:
-        def stage(state, row):
-            (t, y, result), (h, data, back) = state, row
-            start = tree.values(y[0])
-            y, found = self._stage(system, t, h, data, y)
-            failure = dfx.RESULTS.where(found, SUCCESSFUL, CONSTRAINT_NOT_SOLVED)
-            if system.term.check_inverse:
-                values = lax.stop_gradient(tree.values(y))
-                (end, _), found = self._stage(system, t + h, -h, back, values)
-                miss, unit = tree.largest(tree.sub(end, start)), tree.largest(end)
-                found &= miss <= float(jnp.finfo(unit.dtype).eps) ** (2 / 3) * unit
-                other = dfx.RESULTS.where(found, SUCCESSFUL, NOT_REVERSIBLE)
-                failure = dfx.RESULTS.where(failure == SUCCESSFUL, other, failure)
-            result = dfx.RESULTS.where(result == SUCCESSFUL, failure, result)
-            return (t + h, y, result), None
-
-        success = jtu.tree_map(jnp.asarray, SUCCESSFUL)
-        start, single = (t, y, success), len(data[0]) == 1
-        return lax.scan(stage, start, data, unroll=single)[0][1:]
-
-    def _stage(self, system, t, h, data, y) -> tuple[State, Array]:
-        term, free, args, q = system.term, _free(system), system.args, y[0]
-        q, normal = tree.values(q), term.normal(t, tree.values(q), args)
-        # The unknown are momenta times the length, which may be zero.
-        per_length = -1 / jnp.where(h == 0, 1, h)
-
-        def moved(x: Multipliers) -> State:
-            start = system.add(y, (None, tree.scale(per_length, normal(x))))
-            return self.base.drift(free, t, h, data, start)
-
-        like = jnp.zeros_like(term.value(t, q, args))
-        ahead = tree.values(moved(like)[0])
-        unit = jnp.maximum(tree.largest(q), tree.largest(ahead))
-        small = term.is_small(t, q, unit, args)
-        miss = lambda x: term.value(t + h, tree.values(moved(x)[0]), args)
-        x, found = find_root(miss, like, small, term.linear_solver)
-        y = moved(x)
-        change = term.to_tangent(t + h, *tree.values(y), args)
-        return system.add(y, (None, change)), found
-
-    def force(self, system, t, y) -> PyTree:
-        force, (q, _) = self.base.force(_free(system), t, y), tree.values(y)
-        if not self._is_plain:
-            return force
-        change = system.term.to_tangent(t, q, force, system.args, flow=0.0)
-        return tree.sum(force, change)
-
-    @property
-    def _is_plain(self) -> bool:
-        """Whether a kick is by a force alone."""
-        return "separable" in self.base.kinds
-
-    def kick(self, system, t, h, y, force, order) -> State:
-        if self._is_plain:
-            return self.base.kick(_free(system), t, h, y, force, order)
-        stage = lambda y, h: (self._kick_stage(system, t, h, y, force, order), None)
-        return lax.scan(stage, y, lengths(order, h))[0]
-
-    def _kick_stage(self, system, t, h, y, force, order) -> State:
-        """A kick with friction: two halves, and the multipliers between them."""
-        term, free, args = system.term, _free(system), system.args
-        half = lambda y: self.base.kick(free, t, h / 2, y, force, order)
-        middle, (q, p) = half(y), tree.values(y)
-        normal = term.normal(t, q, args)
-
-        def pushed(x: Multipliers) -> State:
-            return half(system.add(middle, (None, tree.scale(-1, normal(x)))))
-
-        def rate(x: Multipliers) -> Multipliers:
-            return term.rate(t, q, tree.values(pushed(x))[1], args)
-
-        speeds = [term.velocity(t, q, x, args) for x in (p, tree.values(middle)[1])]
-        small = term.is_small(t, q, jnp.maximum(*map(tree.largest, speeds)), args)
-        like = jnp.zeros_like(term.value(t, q, args))
-        x, found = find_root(rate, like, small, term.linear_solver)
-        return tree.invalid_if(~found, pushed(x))

@@ -151,7 +151,7 @@ class ManifoldSystem(AbstractSystem):
             return tree.dot(p, v) / 2 + self.potential(t, q, args)
 
     def velocity(self, t: Time, q: Q, p: P, args: PyTree = None) -> Q:
-        return self._free_rates(q, p)[0]
+        return self._each("velocity", q, p)
 
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         return self.velocity_and_force(t, q, p, args)[1]
@@ -169,10 +169,14 @@ class ManifoldSystem(AbstractSystem):
 
         return self.pair(self.map(rates, q, p))
 
+    def to_momentum(self, q: Q, force: Q) -> P:
+        """The rate of change of the momenta by a force in ambient coordinates."""
+        return self._each("pull", q, force)
+
     def kick(self, t: Time, q: Q, p: P, args: PyTree) -> P:
         """The rate of change of the momenta by the potential."""
         if not isinstance(self.potential, ForceField):
-            return self._each("pull", q, self.potential.force(t, q, args))
+            return self.to_momentum(q, self.potential.force(t, q, args))
         force = match(self.potential.fn(t, q, args), p, "`force`", "`p`")
         return self.map(lambda m, q, x: m.project(q, x)[1], q, force)
 

@@ -31,6 +31,10 @@ class AbstractManifold(eqx.Module):
         """The free motion over a time `s`."""
 
     @abc.abstractmethod
+    def velocity(self, q: Array, p: Array) -> Array:
+        """The rate of change of the positions, linear in the momentum."""
+
+    @abc.abstractmethod
     def pull(self, q: Array, force: Array) -> Array:
         """The rate of change of the momentum by an ambient force, `-dV/dq`."""
 
@@ -62,7 +66,10 @@ class Euclidean(AbstractManifold):
         self.mass = as_positive(mass, "`Euclidean(mass)`")
 
     def flow(self, q: Array, p: Array, s: Array) -> Both:
-        return q + s * p / cast_to(self.mass, p), p
+        return q + s * self.velocity(q, p), p
+
+    def velocity(self, q: Array, p: Array) -> Array:
+        return p / cast_to(self.mass, p)
 
     def pull(self, q: Array, force: Array) -> Array:
         return force
@@ -96,6 +103,9 @@ class Sphere(AbstractManifold):
         speed = _size(p)
         c, d = jnp.cos(s * speed), s * _sinc(s * speed)
         return self.project(c * q + d * p, c * p - d * speed**2 * q)
+
+    def velocity(self, q: Array, p: Array) -> Array:
+        return p
 
     def pull(self, q: Array, force: Array) -> Array:
         return force - _inner(force, q) * q
@@ -131,6 +141,9 @@ class Stiefel(AbstractManifold):
         # A step of Newton's method, as they are orthonormal but for rounding.
         q = q @ (3 * jnp.eye(k, dtype=q.dtype) - q.T @ q) / 2
         return q, self.pull(q, p)
+
+    def velocity(self, q: Array, p: Array) -> Array:
+        return p
 
     def pull(self, q: Array, force: Array) -> Array:
         both = q.T @ force
@@ -203,6 +216,12 @@ class Attitude(AbstractManifold):
 
         # A loop, as the same six times would take very long to compile.
         return self.project(*lax.scan(turn, (q, p), rates)[0])
+
+    def velocity(self, q: Array, p: Array) -> Array:
+        turn = p / cast_to(self.inertia, p) / 2
+        return _multiply(
+            q, jnp.concatenate([jnp.zeros_like(q[..., :1]), turn], axis=-1)
+        )
 
     def pull(self, q: Array, force: Array) -> Array:
         inverse = jnp.concatenate([q[..., :1], -q[..., 1:]], axis=-1)

@@ -1,0 +1,123 @@
+"""Drifts and kicks on the constraints of a system."""
+
+from typing import ClassVar
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, PyTree
+
+from .. import _tree as tree
+from .._compositions import lengths
+from .._numbers import State
+from .._results import CONSTRAINT_NOT_SOLVED, NOT_REVERSIBLE, SUCCESSFUL
+from ._bound import System
+from ._manifold import ManifoldSplit
+from ._multipliers import find_root, Multipliers
+from ._split import AbstractSplit
+
+
+def _free(system: System) -> System:
+    """The system without constraints."""
+    return eqx.tree_at(lambda x: x.term, system, system.term.system)
+
+
+class ConstrainedSplit(AbstractSplit):
+    """The drift and the kick of a split, both on the constraint.
+
+    A drift starts with a momentum along the normals, so that it ends on the constraint.
+    It is symmetric, of second order, and composed to the order that is needed.
+    """
+
+    base: AbstractSplit
+    kinds: ClassVar[frozenset[str]] = frozenset({"any"})
+
+    def prepare(self, system, t, h, order) -> PyTree:
+        free, h = _free(system), lengths(order, h)
+        starts = t + jnp.cumsum(h) - h
+        prepare = jax.vmap(lambda t, h: self.base.prepare(free, t, h, order))
+        back = prepare(starts + h, -h) if system.term.check_inverse else None
+        return h, prepare(starts, h), back
+
+    def drift(self, system, t, h, data, y) -> State:
+        return self.attempt(system, t, h, data, y)[0]
+
+    def attempt(self, system, t, h, data, y) -> tuple[State, dfx.RESULTS]:
+        def stage(state, row):
+            (t, y, result), (h, data, back) = state, row
+            start = tree.values(y[0])
+            y, found = self._stage(system, t, h, data, y)
+            failure = dfx.RESULTS.where(found, SUCCESSFUL, CONSTRAINT_NOT_SOLVED)
+            if system.term.check_inverse:
+                values = lax.stop_gradient(tree.values(y))
+                (end, _), found = self._stage(system, t + h, -h, back, values)
+                miss, unit = tree.largest(tree.sub(end, start)), tree.largest(end)
+                found &= miss <= float(jnp.finfo(unit.dtype).eps) ** (2 / 3) * unit
+                other = dfx.RESULTS.where(found, SUCCESSFUL, NOT_REVERSIBLE)
+                failure = dfx.RESULTS.where(failure == SUCCESSFUL, other, failure)
+            result = dfx.RESULTS.where(result == SUCCESSFUL, failure, result)
+            return (t + h, y, result), None
+
+        success = jtu.tree_map(jnp.asarray, SUCCESSFUL)
+        start, single = (t, y, success), len(data[0]) == 1
+        return lax.scan(stage, start, data, unroll=single)[0][1:]
+
+    def _stage(self, system, t, h, data, y) -> tuple[State, Array]:
+        term, free, args, q = system.term, _free(system), system.args, y[0]
+        q, normal = tree.values(q), term.normal(t, tree.values(q), args)
+        # The unknown are momenta times the length, which may be zero.
+        per_length = -1 / jnp.where(h == 0, 1, h)
+
+        def moved(x: Multipliers) -> State:
+            start = system.add(y, (None, tree.scale(per_length, normal(x))))
+            return self.base.drift(free, t, h, data, start)
+
+        like = jnp.zeros_like(term.value(t, q, args))
+        ahead = tree.values(moved(like)[0])
+        unit = jnp.maximum(tree.largest(q), tree.largest(ahead))
+        small = term.is_small(t, q, unit, args)
+        miss = lambda x: term.value(t + h, tree.values(moved(x)[0]), args)
+        x, found = find_root(miss, like, small, term.linear_solver)
+        y = moved(x)
+        change = term.to_tangent(t + h, *tree.values(y), args)
+        return system.add(y, (None, change)), found
+
+    def force(self, system, t, y) -> PyTree:
+        force, (q, _) = self.base.force(_free(system), t, y), tree.values(y)
+        if not self._is_plain:
+            return force
+        change = system.term.to_tangent(t, q, force, system.args, flow=0.0)
+        return tree.sum(force, change)
+
+    @property
+    def _is_plain(self) -> bool:
+        """Whether a kick is by a force alone."""
+        return "separable" in self.base.kinds or isinstance(self.base, ManifoldSplit)
+
+    def kick(self, system, t, h, y, force, order) -> State:
+        if self._is_plain:
+            return self.base.kick(_free(system), t, h, y, force, order)
+        stage = lambda y, h: (self._kick_stage(system, t, h, y, force, order), None)
+        return lax.scan(stage, y, lengths(order, h))[0]
+
+    def _kick_stage(self, system, t, h, y, force, order) -> State:
+        """A kick with friction: two halves, and the multipliers between them."""
+        term, free, args = system.term, _free(system), system.args
+        half = lambda y: self.base.kick(free, t, h / 2, y, force, order)
+        middle, (q, p) = half(y), tree.values(y)
+        normal = term.normal(t, q, args)
+
+        def pushed(x: Multipliers) -> State:
+            return half(system.add(middle, (None, tree.scale(-1, normal(x)))))
+
+        def rate(x: Multipliers) -> Multipliers:
+            return term.rate(t, q, tree.values(pushed(x))[1], args)
+
+        speeds = [term.velocity(t, q, x, args) for x in (p, tree.values(middle)[1])]
+        small = term.is_small(t, q, jnp.maximum(*map(tree.largest, speeds)), args)
+        like = jnp.zeros_like(term.value(t, q, args))
+        x, found = find_root(rate, like, small, term.linear_solver)
+        return tree.invalid_if(~found, pushed(x))
