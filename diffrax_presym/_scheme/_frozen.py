@@ -115,6 +115,19 @@ class PresymplecticLeapfrog(AbstractPresymplecticSolver):
     `(x / 2) coth(x / 2)` times too fast, and the momentum too large by this factor,
     with `first="position"` `(x / 2) / sinh(x / 2)` times what it should be.
 
+    With a mass `m` and a constant rate `γ` a step of `h` from `t` is, with
+    `d = exp(-γ h)`,
+
+        p_half = p - h / 2 * grad V(t, q)
+        q_end = q + h / 2 * (1 + d) * p_half / m
+        p_end = d * p_half - h / 2 * grad V(t + h, q_end)
+
+    and with `first="position"`, with `s = exp(-γ h / 2)`,
+
+        q_half = q + h / 2 * s * p / m
+        p_end = s**2 * p - h * s * grad V(t + h / 2, q_half)
+        q_end = q_half + h / 2 * p_end / (s * m)
+
     Equations (presymp_leapfrog) and (presymp_leapfrog2) of França, Jordan
     and Vidal (2021).
     """
