@@ -142,7 +142,8 @@ def test_pages_draw_the_pictures_they_show(page):
 
 
 def test_recipes_for_other_libraries_are_those_of_the_examples():
-    pages = (ROOT / "docs" / "howto" / f"{x}.md" for x in ("clients", "sampling"))
+    names = ("clients", "sampling", "small_recipes")
+    pages = (ROOT / "docs" / "howto" / f"{x}.md" for x in names)
     blocks = [x["code"] for page in pages for x in FENCE.finditer(page.read_text())]
     recipes = [x for x in blocks if x.startswith(("# examples/", "# benchmarks/"))]
     clients = list((ROOT / "examples" / "clients").glob("[!_]*.py"))
