@@ -27,10 +27,13 @@ def joints(t, q, args):
     return jnp.concatenate([upper[0], upper[1] - lower[0]])
 
 
-def pendulum(rate=RATE):
+DAMPING = dps.ConstantDamping(RATE)
+
+
+def pendulum(friction=DAMPING):
     weight = lambda t, q, args: G * jnp.sum(MASS * q[0][:, 2])
     bodies = dps.Euclidean(MASS[:, None]), dps.Attitude(INERTIA)
-    free = dps.ManifoldSystem(bodies, weight, dps.ConstantDamping(rate))
+    free = dps.ManifoldSystem(bodies, weight, friction)
     return dps.ConstrainedSystem(free, joints)
 
 
@@ -96,6 +99,18 @@ def test_order(solver, order, dt0):
     assert np.max(off) < 1e-14
 
 
+def test_friction_by_a_function_of_time():
+    y0, ends = in_plane(START[:2], START[2:]), []
+    for friction in (DAMPING, lambda t: RATE * t):
+        ys = diffeqsolve(
+            *(pendulum(friction), dps.Suzuki4(dps.Strang()), 0.0, 0.5, 0.1, y0),
+            adjoint=dps.FixedStepAdjoint(),
+        ).ys
+        ends.append(jax.tree.leaves(ys))
+    for x, y in zip(*ends, strict=True):
+        np.testing.assert_allclose(y, x, atol=1e-14)
+
+
 def in_space():
     """A start out of the plane."""
     system = pendulum()
@@ -129,7 +144,7 @@ def test_gradient():
         (q, a), (p, spin) = y0
         start = system.project(0.0, ((q, a), (x[0] * p, spin)))
         ys = diffeqsolve(
-            *(pendulum(x[1]), dps.Strang(), 0.0, 1.0, 0.1, start),
+            *(pendulum(dps.ConstantDamping(x[1])), dps.Strang(), 0.0, 1.0, 0.1, start),
             saveat=dfx.SaveAt(ts=jnp.array([0.33, 1.0])),
             adjoint=dps.FixedStepAdjoint(),
             max_steps=None,

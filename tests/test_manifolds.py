@@ -5,6 +5,7 @@ from functools import cache
 from typing import Any
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -58,7 +59,8 @@ def top_field(gamma):
         R, p = y[:9].reshape(3, 3), y[9:]
         slope = np.zeros((3, 3))
         slope[2, 2] = gravity(t)
-        dR, dp = body_rates(R, p, slope, gamma)
+        rates = gamma(t) if callable(gamma) else gamma
+        dR, dp = body_rates(R, p, slope, rates)
         return np.concatenate([np.ravel(dR), dp])
 
     return field
@@ -96,6 +98,13 @@ def trace(t, q, args):
     return jnp.sum(q * SQUARE)
 
 
+class LogScale(eqx.Module):
+    part: float = 1.0
+
+    def __call__(self, t):
+        return self.part * (0.5 * t + jnp.sin(t))
+
+
 # The system, a state near one of it, and its equations in NumPy.
 CASES = {
     "top": (
@@ -110,6 +119,10 @@ CASES = {
         ),
         *((Q, L), top_field(0.3 * np.eye(3))),
     ),
+    "top, rate of time": (
+        dps.ManifoldSystem(dps.Attitude(INERTIA), top_potential, LogScale()),
+        *((Q, L), top_field(lambda t: (0.5 + np.cos(t)) * np.eye(3))),
+    ),
     "floating body": (
         dps.ManifoldSystem(
             (dps.Euclidean(2.0), dps.Attitude(INERTIA)),
@@ -121,6 +134,11 @@ CASES = {
         dps.ManifoldSystem(dps.Sphere(), form, dps.LogDamping(3.0, 1.0)),
         (MATRIX[:, 0], MATRIX[:, 1]),
         orthonormal(lambda t: 3 / (1 + t), lambda q: FORM @ q, (4, 1)),
+    ),
+    "sphere, rate of time": (
+        dps.ManifoldSystem(dps.Sphere(), form, LogScale()),
+        (MATRIX[:, 0], MATRIX[:, 1]),
+        orthonormal(lambda t: 0.5 + np.cos(t), lambda q: FORM @ q, (4, 1)),
     ),
     "Stiefel": (
         dps.ManifoldSystem(dps.Stiefel(), form, dps.ConstantDamping(0.2)),

@@ -28,6 +28,12 @@ class EntryFriction(eqx.Module):
         (law, _), *others = self.terms
         return not others and type(law).effect is not AbstractLogScale.effect
 
+    @property
+    def is_one_rate(self) -> bool:
+        """Whether all entries decay alike, whatever the momentum."""
+        is_number = lambda law, rate: law.shape == () and jnp.shape(rate) == ()
+        return all(is_number(*term) for term in self.terms)
+
     def prepare(self, t: Time, h: Time, order: int) -> Effect:
         if len(self.terms) == 1:
             ((law, rate),) = self.terms
@@ -97,6 +103,7 @@ class MatrixFriction(eqx.Module):
     matrix: Inexact[Array, "*batch n n"]
     is_autonomous = True
     is_known = True
+    is_one_rate = False
 
     def prepare(self, t: Time, h: Time, order: int) -> Effect:
         return Effect(*[as_time(h)] * 3)

@@ -52,6 +52,12 @@ class LinearFriction(eqx.Module):
         leaves = jtu.tree_leaves(self.leaves, is_leaf=_is_leaf)
         return all(leaf.is_known for leaf in leaves)
 
+    @property
+    def is_one_rate(self) -> bool:
+        """Whether all entries of each leaf decay alike, whatever the momentum."""
+        leaves = jtu.tree_leaves(self.leaves, is_leaf=_is_leaf)
+        return all(leaf.is_one_rate for leaf in leaves)
+
     def prepare(self, t: Time, h: Time, order: int) -> Effects:
         """What it does from `t` to `t + h`; of at least the given order in `h` where it
         is not known in closed form."""

@@ -48,6 +48,11 @@ class FrictionOverStep(eqx.Module):
         self.decayed, self.grown = fit(expm1(-lost)), fit(expm1(lost))
 
     is_autonomous = False
+    is_known = False
+
+    @property
+    def is_one_rate(self) -> bool:
+        return self.exact.is_one_rate
 
     def growth(self, t: Time, h: Time) -> Scalar:
         # Of so much friction that rounding matters no polynomial is right to rounding.

@@ -15,7 +15,6 @@ from .._compositions import lengths
 from .._forms import divide
 from .._friction._base import AbstractFriction, MASS, Mechanics
 from .._friction._damping import as_laws
-from .._friction._leaf import EntryFriction, MatrixFriction
 from .._numbers import cast_to, Scalar, State, Time
 from ._base import AbstractSystem, P, Q
 from ._bound import System
@@ -159,15 +158,12 @@ class ManifoldSystem(AbstractSystem):
     def velocity_and_force(
         self, t: Time, q: Q, p: P, args: PyTree = None
     ) -> tuple[Q, P]:
-        velocity, free = self._free_rates(q, p)
-        return velocity, tree.sum(free, self.kick(t, q, p, args))
-
-    def _free_rates(self, q: Q, p: P) -> State:
-        def rates(m: AbstractManifold, q: Array, p: Array):
+        def free(m: AbstractManifold, q: Array, p: Array) -> tuple[Array, Array]:
             zero, one = jnp.zeros((), p.dtype), jnp.ones((), p.dtype)
             return jax.jvp(lambda s: m.flow(q, p, s), (zero,), (one,))[1]
 
-        return self.pair(self.map(rates, q, p))
+        velocity, force = self.pair(self.map(free, q, p))
+        return velocity, tree.sum(force, self.kick(t, q, p, args))
 
     def to_momentum(self, q: Q, force: Q) -> P:
         """The rate of change of the momenta by a force in ambient coordinates."""
@@ -229,15 +225,7 @@ class ManifoldSplit(AbstractSplit):
 def _only_shortens(system: System) -> bool:
     """Whether friction is at one rate for each manifold, so that it changes how far a
     motion goes and not where; `ValueError` if it has to be."""
-    if system.friction is None:
-        return True
-    is_number = lambda law, rate: law.shape == () and jnp.shape(rate) == ()
-    is_rate = lambda x: (
-        isinstance(x, EntryFriction) and all(is_number(*term) for term in x.terms)
-    )
-    is_friction = lambda x: isinstance(x, EntryFriction | MatrixFriction)
-    leaves = jtu.tree_leaves(system.friction.leaves, is_leaf=is_friction)
-    if all(map(is_rate, leaves)):
+    if system.friction is None or system.friction.is_one_rate:
         return True
     if not system.term.is_free:
         raise ValueError(
