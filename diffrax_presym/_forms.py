@@ -177,7 +177,9 @@ def divide(form, x: PyTree, name: str, state: str, symmetric=True) -> PyTree:
         return x
     if is_operator(form):
         _check_symmetric(symmetric, name)
-        return solve_linear(form.mv, x, lx.AutoLinearSolver(True), lambda _: form)
+        known, transposed = lambda *_: form, lambda *_: form.T
+        how = lx.AutoLinearSolver(True)
+        return solve_linear(form.mv, x, how, known, transposed)
 
     def leaf(x, form):
         if not is_matrix(form, x):

@@ -57,21 +57,26 @@ def solve_linear(
     linear: Callable[[PyTree], PyTree],
     b: PyTree,
     solver: lx.AbstractLinearSolver,
-    operator: Callable[..., lx.AbstractLinearOperator] | None = None,
+    operator: Callable[..., lx.AbstractLinearOperator] = lx.FunctionLinearOperator,
+    transposed: Callable[..., lx.AbstractLinearOperator] | None = None,
 ) -> PyTree:
-    """The solution of a linear system by Lineax, which is given as `operator(linear)`
-    if it has a structure; NaN if there is none, in derivatives too, where Lineax itself
-    would end all members of a batch."""
+    """The solution of a linear system by Lineax; NaN if there is none, in derivatives
+    too, where Lineax itself would end all members of a batch.
 
-    def attempt(linear, b):
-        if operator is None:
-            known = lx.FunctionLinearOperator(linear, jax.eval_shape(lambda: b))
-        else:
-            known = operator(linear)
-        found = lx.linear_solve(known, b, solver, throw=False)
-        return tree.invalid_if(found.result != lx.RESULTS.successful, found.value)
+    `operator(linear, structure)` is the system with what is known of its structure,
+    `transposed` that of derivatives by reverse mode, if this differs.
+    """
 
-    return lax.custom_linear_solve(linear, b, attempt, attempt)
+    def attempt(operator):
+        def solve(linear, b):
+            known = operator(linear, jax.eval_shape(lambda: b))
+            found = lx.linear_solve(known, b, solver, throw=False)
+            return tree.invalid_if(found.result != lx.RESULTS.successful, found.value)
+
+        return solve
+
+    both = attempt(operator), attempt(transposed or operator)
+    return lax.custom_linear_solve(linear, b, *both)
 
 
 def contract(g, y: PyTree) -> PyTree:

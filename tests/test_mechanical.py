@@ -456,3 +456,13 @@ def test_a_momentum_that_is_not_finite_is_one_member_of_a_batch():
     inverse = np.linalg.inv(mass.matrix)
     np.testing.assert_allclose(slopes[0], 2 * inverse @ inverse @ p[0], rtol=1e-14)
     assert np.all(np.isnan(slopes[1]))
+
+
+def test_the_gradient_through_an_operator_that_is_not_symmetric():
+    matrix = jnp.array([[2.0, 0.5], [-0.3, 1.0]])
+    like = jax.ShapeDtypeStruct((2,), matrix.dtype)
+    mass = dps.QuadraticKinetic(lx.FunctionLinearOperator(lambda v: matrix @ v, like))
+    p = jnp.array([1.0, 2.0])
+    slope = jax.grad(lambda p: jnp.sum(mass.velocity(0.0, p) ** 2))(p)
+    inverse = np.linalg.inv(matrix)
+    np.testing.assert_allclose(slope, 2 * inverse.T @ inverse @ p, rtol=1e-14)

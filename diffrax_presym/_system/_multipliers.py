@@ -24,24 +24,26 @@ def solve(
 ) -> Multipliers:
     """The solution of a linear system, by its matrix unless a solver is given; NaN if
     there is none."""
-    operator = lambda linear: _operator(linear, b, solver)
+    operator = lambda linear, like: _operator(linear, like, solver)
     return solve_linear(linear, b, lx.LU() if solver is None else solver, operator)
 
 
 def _operator(
-    linear: LinearMap, b: Multipliers, solver: lx.AbstractLinearSolver | None
+    linear: LinearMap,
+    like: jax.ShapeDtypeStruct,
+    solver: lx.AbstractLinearSolver | None,
 ) -> lx.AbstractLinearOperator:
     if isinstance(solver, lx.Tridiagonal):
         # Each row couples three neighbours, so three products show all entries.
-        row = jnp.arange(b.size)
-        products = jax.vmap(lambda k: linear((row % 3 == k).astype(b.dtype)))
+        row = jnp.arange(like.size)
+        products = jax.vmap(lambda k: linear((row % 3 == k).astype(like.dtype)))
         columns = products(jnp.arange(3))
         lower, diagonal, upper = (columns[(row + k) % 3, row] for k in (-1, 0, 1))
         return lx.TridiagonalLinearOperator(diagonal, lower[1:], upper[:-1])
     if solver is None:
-        matrix = jax.vmap(linear, out_axes=1)(jnp.eye(b.size, dtype=b.dtype))
+        matrix = jax.vmap(linear, out_axes=1)(jnp.eye(like.size, dtype=like.dtype))
         return lx.MatrixLinearOperator(matrix)
-    return lx.FunctionLinearOperator(linear, jax.eval_shape(lambda: b))
+    return lx.FunctionLinearOperator(linear, like)
 
 
 def is_regular(
