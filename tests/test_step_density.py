@@ -251,6 +251,26 @@ def test_the_time_scale_of_a_system():
     assert_close(scale(DRAGGED, q), 5**-0.25 * 0.5**1.5, 1e-12)
 
 
+@pytest.mark.parametrize("bodies, space", [(3, 2), (7, 2), (50, 3)])
+def test_the_time_scale_of_many_bodies_is_an_estimate(bodies, space):
+    i, j = np.triu_indices(bodies, 1)
+    potential = lambda t, q, args: -jnp.sum(1 / jnp.linalg.norm(q[i] - q[j], axis=-1))
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), potential)
+    estimate = control(1.0, system).density
+    rng = np.random.default_rng(bodies)
+    q = rng.standard_normal((40, bodies, space))
+    # In half of the states two bodies are close.
+    q[::2, 1] = q[::2, 0] + 0.02 * rng.standard_normal((20, space))
+
+    @jax.vmap
+    def ratio(q):
+        J = jax.hessian(potential, 1)(0.0, q, None)
+        return estimate(0.0, (q, 0 * q), None) * jnp.sum(J**2) ** 0.25
+
+    ratios = ratio(jnp.asarray(q))
+    assert 0.75 < np.min(ratios) < 0.999 and 1.001 < np.max(ratios) < 1.4
+
+
 @pytest.mark.parametrize("backwards", [False, True])
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_close_encounters_are_right_or_fail(dtype, backwards):
