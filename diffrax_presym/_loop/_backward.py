@@ -10,12 +10,12 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Int, PyTree
+from jaxtyping import Array, Bool, Int, PyTree
 
 from .. import _tree as tree
 from .._numbers import State
 from .._scheme._base import Point
-from ._nodes import NODES, Stencils
+from ._nodes import Found, NODES
 from ._problem import Functions, Problem
 from ._run import end_is_separate, Trace
 from ._tracks import put, stack
@@ -91,12 +91,15 @@ class Backward(eqx.Module):
 
     @property
     def tracks(self) -> list["AbstractPull"]:
-        problem, tracks = self.problem, []
-        for i, (rows, stencils) in enumerate(
-            zip(problem.rows, problem.stencils, strict=True)
-        ):
-            tracks += [PullRows(i, rows.stop)] if len(rows) else []
-            tracks += [] if stencils is None else [PullNodes(i, stencils)]
+        tracks, pairs = [], zip(self.problem.rows, self.trace.found, strict=True)
+        for i, (rows, found) in enumerate(pairs):
+            taken = rows.taken(self.trace.n)
+            if found is not None and found.weights is not None:
+                between = taken & found.is_interpolated
+                tracks.append(PullNodes(i, _up_to(between), found))
+                taken &= ~between
+            if len(rows):
+                tracks.append(PullRows(i, _up_to(taken), rows.stop))
         return tracks
 
     def start(self, at: BackwardState) -> BackwardState:
@@ -173,6 +176,8 @@ class AbstractPull(eqx.Module):
     """How what a track collected is pulled back, on the way back."""
 
     i: int = eqx.field(static=True)  # the output
+    # Of so many rows, how many there are up to the last that is pulled back.
+    up_to: Int[Array, " rows+1"]
 
     @abc.abstractmethod
     def start(self, backward: Backward) -> PyTree:
@@ -190,29 +195,21 @@ class AbstractPull(eqx.Module):
 
 
 class PullRows(AbstractPull):
-    """Values at steps, or of shorter ones from there; the state is their number."""
+    """Values at steps, or of shorter ones from there; the state is the number of rows
+    that are left."""
 
     stops: Array
 
     def start(self, backward):
-        problem, i = backward.problem, self.i
-        number = jnp.sum(problem.rows[i].reached(backward.trace.n))
-        stencils = problem.stencils[i]
-        return (
-            number if stencils is None else jnp.where(stencils.ways.others, number, 0)
-        )
+        return self.up_to[-1]
 
     def due(self, state, n):
-        stop = self.stops[state - 1]
-        return jnp.where(state > 0, jnp.where(stop < 0, n, stop), -1)
+        return jnp.where(state > 0, self.stops[state - 1], -1)
 
     def pull(self, backward, at, state):
         i, j, problem = self.i, state - 1, backward.problem
-        rows = problem.rows[i]
-        taken = rows.stop[j] >= 0
-        if (stencils := problem.stencils[i]) is not None:
-            taken &= ~stencils.ways.interpolated
-        bar = backward.row(i, int(problem.subs[i].t0) + j, taken)
+        rows, left = problem.rows[i], self.up_to[j]
+        bar = backward.row(i, int(problem.subs[i].t0) + j, state > 0)
 
         def pull(shorter: bool):
             def output(functions: Functions, start: Point):
@@ -221,51 +218,54 @@ class PullRows(AbstractPull):
             return backward.pull(output, bar, at.point)
 
         if not rows.may_be_inside:
-            return at.add(*pull(False)), j
+            return at.add(*pull(False)), left
         # Decided before the derivative is taken: in a batch, JAX would differentiate
         # the branch that is not taken at zeros, where an implicit step is singular.
         pulled = lax.cond(rows.inside[j], lambda: pull(True), lambda: pull(False))
-        return at.add(*pulled), j
+        return at.add(*pulled), left
 
 
 class PullNodes(AbstractPull):
     """Values between steps, by the cotangents of the last few nodes."""
 
-    stencils: Stencils
+    found: Found
 
     def start(self, backward):
         n, node = backward.trace.n, (backward.trace.end[0],) * 3
-        number, _ = backward.trace.between[self.i]
-        return n + 1, n + 1, number, _zeros(stack(node, NODES))
+        ring = stack((backward.problem.steps.t0, node), NODES)
+        return n + 1, n + 1, self.up_to[-1], _zeros(ring)
+
+    def _last(self, number: Array) -> Array:
+        """The last node of the last of so many rows."""
+        last = self.found.first[number - 1] + NODES - 1
+        return jnp.where(number > 0, last, -1)
 
     def due(self, state, n):
-        node, low, j, _ = state
-        last = self.stencils.last[j - 1]
-        row = jnp.where(j > 0, jnp.where(last < 0, n, last), -1)
-        return jnp.where(node > low, node - 1, row)
+        node, low, number, _ = state
+        return jnp.where(node > low, node - 1, self._last(number))
 
     def pull(self, backward, at, state):
         problem, i, n = backward.problem, self.i, at.n
         rows, start = problem.rows[i], problem.start[0]
 
         def spread(x):
-            gradient, low, j, bars = x
-            j = j - 1
-            taken = (rows.stop[j] >= 0) & self.stencils.ways.interpolated
+            gradient, _, number, bars = x
+            taken, j = number > 0, number - 1
             bar = backward.row(i, int(problem.subs[i].t0) + j, taken)
             # Of the others nothing may fail of which a gradient takes zero times.
             time = jnp.where(taken, rows.time[j], problem.steps.t0)
-            y = jtu.tree_map(lambda x: x[j], backward.trace.between[i][1])
+            y = jtu.tree_map(lambda x: x[j], self.found.state)
             y = tree.where(taken, y, start)
             output = lambda functions, y: functions.outputs[i](time, y)
             more, bar = backward.pull(output, bar, y)
-            bars = self.stencils.spread(j, bar, bars)
-            low = jnp.where(rows.stop[j] >= 0, self.stencils.first[j], low)
-            return tree.sum(gradient, more), low, j, bars
+            bars, gradient = (
+                self.found.spread(j, bar, bars),
+                tree.sum(gradient, more),
+            )
+            return gradient, self.found.first[j], self.up_to[j], bars
 
         def unspread(x):
-            last = self.stencils.last[x[2] - 1]
-            return (x[2] > 0) & ((last < 0) | (last >= n))
+            return self._last(x[2]) >= n
 
         def pull(side: Array, at: BackwardState, bars: PyTree):
             node = lambda functions, point: functions.node(n, side, point)
@@ -273,18 +273,24 @@ class PullNodes(AbstractPull):
             at = at.add(*backward.pull(node, bar, at.point))
             return at, put(bars, n % NODES, _zeros(bar))
 
-        _, low, j, bars = state
+        _, low, number, bars = state
         kink, kinks = jnp.zeros((), int), problem.steps.kinks
         if kinks is not None:
             kink = jnp.any(kinks == n).astype(int)
             after = lambda: pull(kink, at, bars)
             at, bars = lax.cond(kink == 1, after, lambda: (at, bars))
-        gradient, low, j, bars = lax.while_loop(
-            unspread, spread, (at.gradient, low, j, bars)
+        gradient, low, number, bars = lax.while_loop(
+            unspread, spread, (at.gradient, low, number, bars)
         )
         at = eqx.tree_at(lambda at: at.gradient, at, gradient, is_leaf=_is_none)
         at, bars = pull(-kink, at, bars)
-        return at, (n, low, j, bars)
+        return at, (n, low, number, bars)
+
+
+def _up_to(pulled: Bool[Array, " rows"]) -> Int[Array, " rows+1"]:
+    """Of so many rows, how many there are up to the last that is pulled back."""
+    numbers = jnp.where(pulled, jnp.arange(1, len(pulled) + 1), 0)
+    return jnp.append(jnp.zeros((), int), lax.cummax(numbers))
 
 
 _is_none = lambda x: x is None

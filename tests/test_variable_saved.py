@@ -1,0 +1,160 @@
+"""Saved values of variable steps, from the ends of the steps around them: beside
+Kepler's equation, the shorter steps of Diffrax's loop, and central differences."""
+
+from functools import cache, partial
+from typing import Any
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+
+import diffrax_presym as dps
+
+
+diffeqsolve: Any = dfx.diffeqsolve
+OWN: Any
+THEIRS: Any
+OWN, THEIRS = dps.FixedStepAdjoint(), dfx.RecursiveCheckpointAdjoint()
+ECCENTRICITY = 0.7
+TS = np.linspace(0.0, 12.0, 101)
+
+
+def kepler(rate=None):
+    potential = lambda t, q, args: -1 / jnp.linalg.norm(q)
+    friction = None if rate is None else dps.ConstantDamping(rate)
+    return dps.MechanicalSystem(dps.QuadraticKinetic(), potential, friction)
+
+
+def solve(system, epsilon, ts, adjoint=OWN, solver=None, y0=None, **options):
+    """From the apocentre."""
+    e = ECCENTRICITY
+    start = jnp.array([-1 - e, 0.0]), jnp.array([0.0, -(((1 - e) / (1 + e)) ** 0.5)])
+    t1 = options.pop("t1", ts[-1])
+    return diffeqsolve(
+        *(system, solver or dps.TunedRKN6(), 0.0, t1, None, y0 or start),
+        stepsize_controller=dps.StepDensityController(epsilon, system),
+        adjoint=adjoint,
+        **{"saveat": dfx.SaveAt(ts=jnp.asarray(ts)), "max_steps": 2000} | options,
+    )
+
+
+def positions(ts):
+    """By Kepler's equation, the time from the apocentre."""
+    e, mean = ECCENTRICITY, np.asarray(ts) + np.pi
+    late = lambda x, m: x - e * np.sin(x) - m
+    find: Any = partial(scipy.optimize.brentq, late, xtol=1e-15)
+    x = np.array([find(m - 2, m + 2, args=(m,)) for m in mean])
+    return np.stack([np.cos(x) - e, (1 - e**2) ** 0.5 * np.sin(x)], axis=1)
+
+
+SOLVERS = {
+    "RKN4": (dps.BlanesMoanRKN4(), 1.0),
+    "RKN6": (dps.TunedRKN6(), 0.8),
+    "RKN8": (dps.BlanesCasasRKN8(), 0.8),
+    "composition": (dps.SofroniouSpaletta(6, dps.PresymplecticLeapfrog()), 0.8),
+}
+
+
+@pytest.mark.parametrize("parts", [1, 3])
+@pytest.mark.parametrize("name", SOLVERS)
+def test_the_error_between_steps_is_that_at_their_ends(name, parts):
+    (solver, epsilon), system = SOLVERS[name], kepler()
+    sol = solve(system, epsilon / parts, TS, solver=solver)
+    steps = {"saveat": dfx.SaveAt(steps=True), "t1": TS[-1]}
+    ends = solve(system, epsilon / parts, TS, THEIRS, solver, **steps)
+    n = int(ends.stats["num_steps"])
+    assert sol.stats["interpolated"] and sol.stats["num_steps"] == n
+    error = lambda ts, q: np.max(np.abs(q - positions(ts)), axis=1)
+    at_ends = np.max(error(ends.ts[:n], ends.ys[0][:n]))
+    assert 1e-11 < np.max(error(TS, sol.ys[0])) < 1.5 * at_ends
+
+
+def test_saved_values_do_not_depend_on_other_saved_times():
+    system = kepler()
+    all_of_them = solve(system, 0.2, TS).ys
+    for some in (slice(None, None, 50), slice(31, 32), slice(98, None)):
+        ys = solve(system, 0.2, TS[some], t1=TS[-1]).ys
+        for x, y in zip(ys, all_of_them, strict=True):
+            np.testing.assert_allclose(x, y[some], rtol=1e-13, atol=1e-13)
+
+
+def test_where_interpolation_cannot_follow_the_motion_steps_are_shorter():
+    # Fewer than three steps; friction of more than 0.5 over a step.
+    for rate, epsilon, t1 in ((0.01, 0.1, 0.2), (9.0, 0.2, 3.0)):
+        ts = np.linspace(0.0, t1, 8)
+        ours, theirs = (solve(kepler(rate), epsilon, ts, x) for x in (OWN, THEIRS))
+        assert not ours.stats["interpolated"]
+        for x, y in zip(ours.ys, theirs.ys, strict=True):
+            np.testing.assert_allclose(x, y, atol=1e-9)
+
+
+def test_gaps_and_the_end_of_a_solve():
+    ts = np.array([np.nan, 0.0, np.nan, 3.0, 3.01, np.nan, 12.0])
+    sol = solve(kepler(), 0.2, ts)
+    gap = np.isnan(ts)
+    assert np.all(np.isinf(sol.ys[0][gap]))
+    np.testing.assert_allclose(sol.ys[0][~gap], positions(ts[~gap]), atol=1e-5)
+    short = solve(kepler(), 0.2, TS, max_steps=40, throw=False)
+    assert short.result == dfx.RESULTS.max_steps_reached
+    reached = np.isfinite(short.ts)
+    whole = solve(kepler(), 0.2, TS).ys[0]
+    assert 10 < np.sum(reached) < 90
+    # The last step is one-sided.
+    np.testing.assert_allclose(short.ys[0][reached], whole[reached], atol=1e-8)
+
+
+def test_backwards_in_time_and_in_single_precision():
+    system, ts = kepler(0.05), -TS[:60]
+    q, p = solve(system, 0.2, ts).ys
+    shorter = solve(system, 0.2, ts, THEIRS).ys[0]
+    np.testing.assert_allclose(q, shorter, atol=1e-5)
+    assert np.max(np.abs(q - shorter)) > 0
+    y0 = jax.tree.map(lambda y: jnp.asarray(y[0], jnp.float32), (q, p))
+    sol = solve(system, 0.2, ts.astype(np.float32), y0=y0, solver=dps.BlanesMoanRKN4())
+    assert sol.ys[0].dtype == jnp.float32 and sol.stats["interpolated"]
+    np.testing.assert_allclose(sol.ys[0], q, atol=3e-3)
+
+
+# Gradients.
+
+AT = np.array([0.02, 0.9, 1.1])  # friction, and factors of the state
+# Between steps, in one step, near the ends, where steps are shorter, and at the ends.
+TIMES = np.array([0.0, 0.02, 0.3, 1.0, 2.95, 2.96, 3.0, 5.0, 8.9, 8.99, 9.0])
+
+
+@cache
+def loss(adjoint, epsilon=0.2):
+    def of(x):
+        e = ECCENTRICITY
+        q0 = x[1] * jnp.array([-1 - e, 0.0])
+        p0 = x[2] * jnp.array([0.0, -(((1 - e) / (1 + e)) ** 0.5)])
+        ys = solve(kepler(x[0]), epsilon, TIMES, adjoint, y0=(q0, p0)).ys
+        return jnp.sum(ys[0] ** 3 + ys[0]) + jnp.sum(ys[1] ** 2)
+
+    return jax.jit(of)
+
+
+WAYS = {"reversal": OWN, "checkpoints": dps.FixedStepAdjoint("checkpoints")}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_gradients_are_those_of_the_saved_values(way):
+    """With the dependence of the interpolation on the times at which steps end."""
+    fn = loss(WAYS[way])
+    slope = lambda e, h: (fn(AT + h * e) - fn(AT - h * e)) / (2 * h)
+    wanted = [(4 * slope(e, 1e-5) - slope(e, 2e-5)) / 3 for e in np.eye(3)]
+    np.testing.assert_allclose(jax.grad(fn)(AT), wanted, rtol=1e-8)
+
+
+def test_members_of_a_batch_are_as_each_alone():
+    """One of them with friction for which steps are shorter."""
+    points = jnp.asarray(AT * np.array([[1.0, 1, 1], [0.3, 1.1, 0.8], [450.0, 1, 1]]))
+    fn = loss(OWN)
+    values, gradients = jax.vmap(jax.value_and_grad(fn))(points)
+    for i, x in enumerate(points):
+        value, gradient = jax.value_and_grad(fn)(x)
+        np.testing.assert_allclose(values[i], value, rtol=1e-11)
+        np.testing.assert_allclose(gradients[i], gradient, rtol=1e-7, atol=1e-9)
