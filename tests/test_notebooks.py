@@ -26,7 +26,7 @@ def module(monkeypatch):
 
 
 def test_there_are_tutorials():
-    assert len(PAGES) >= 8
+    assert len(PAGES) >= 10
 
 
 @pytest.mark.variants(1000)
