@@ -21,6 +21,7 @@ import numpy as np
 import optimistix as optx
 import own
 import scipy.integrate
+import scipy.spatial
 from helpers import substeps
 from jax.flatten_util import ravel_pytree
 
@@ -49,19 +50,24 @@ class System:
     q: Any
     p: Any
     offers: frozenset[str]  # the splits that it offers without friction
-    # The friction that it takes: "all", "velocities", "rates", "joints", "one rate" or
-    # "none".
+    # The friction that it takes: "all", "velocities", "rates", "joints", "time", "one
+    # rate" or "none".
     takes: str
     mass: Any = None
     bodies: bool = False  # whether the last axis are the coordinates of bodies
     start: float = START
+    constrained: bool = False  # whether its states are on a manifold
+    slow: bool = False  # whether schemes of many stages take minutes to compile
+    # Where there are multipliers: the force with theirs, of t, q, p and that without.
+    react: Callable | None = None
 
     def __repr__(self):
         return self.name
 
     @property
     def size(self):
-        return ravel_pytree(self.q)[0].size
+        """The number of momenta, of which quaternions have more positions."""
+        return ravel_pytree(self.p)[0].size
 
 
 def _flat(*entries):
@@ -293,6 +299,123 @@ def _whirl_force(t, q, p):
     return np.array([-q[0] - q[1] / 2, q[0] / 2 - q[1] ** 3])
 
 
+# Manifolds. Initial states are projected by the systems.
+
+
+def _manifold(manifold, potential):
+    def build(laws, force=None):
+        if force is not None:
+            raise ValueError("write `MechanicalSystem`")
+        return dps.ManifoldSystem(manifold, potential, laws)
+
+    return build
+
+
+def _constrained(free, constraint):
+    def build(laws, force=None):
+        return dps.ConstrainedSystem(free(laws, force), constraint)
+
+    return build
+
+
+def _reaction(slopes, inverse, change, force):
+    """The force and that of constraints with some slopes, by momenta, and the change of
+    their rates without forces."""
+    both = slopes @ inverse
+    multipliers = np.linalg.solve(both @ slopes.T, both @ force + change)
+    return force - slopes.T @ multipliers
+
+
+def _rods(t, q, args):
+    """Two rods, of which the first becomes longer."""
+    square = lambda x: jnp.sum(x**2)
+    return jnp.stack([square(q[0]) - t**3 / 10, square(q[1] - q[0])]) - 1
+
+
+def _rods_potential(t, q, args):
+    return (1 + jnp.cos(t) / 2) * (q[0, 1] + 3 * q[1, 1] / 2)
+
+
+def _rods_force(t, q, p):
+    return -(1 + np.cos(t) / 2) * np.array([0, 1, 0, 1.5])
+
+
+def _rods_react(t, q, p, force):
+    inverse = np.linalg.inv(_MASSES)
+    (a, b), (u, v) = q.reshape(2, 2), (inverse @ p).reshape(2, 2)
+    slopes = 2 * np.array([[*a, 0, 0], [*(a - b), *(b - a)]])
+    change = np.array([2 * u @ u - 0.6 * t, 2 * (v - u) @ (v - u)])
+    return _reaction(slopes, inverse, change, force)
+
+
+def _upright(q):
+    """The vertical, along the axes of a body."""
+    w, x, y, z = q
+    return np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x**2 + y**2)])
+
+
+def _top(t, q, args):
+    x, y, z = dps.rotation_matrix(q)[2]
+    return (1 + jnp.sin(t) / 5) * (z + 0.4 * x * y)
+
+
+def _top_velocity(t, q, p, eta):
+    (w, *u), v = q, p / _INERTIA / 2
+    return np.concatenate([[-np.dot(u, v)], w * v + np.cross(u, v)])
+
+
+def _top_force(t, q, p):
+    u = _upright(q)
+    slope = (1 + np.sin(t) / 5) * np.array([0.4 * u[1], 0.4 * u[0], 1])
+    return np.cross(p, p / _INERTIA) + np.cross(u, slope)
+
+
+def _joint(t, q, args):
+    """Where a body hangs."""
+    arm = jnp.asarray(_ARM, q[0].dtype)
+    return q[0] + dps.rotation_matrix(q[1]) @ arm
+
+
+def _hanging_potential(t, q, args):
+    return (1 + jnp.cos(t) / 2) * (2 * q[0][2] + q[0][0] ** 2)
+
+
+def _hanging_velocity(t, q, p, eta):
+    return np.concatenate([p[:3] / 2, _top_velocity(t, q[3:], p[3:], eta)])
+
+
+def _hanging_force(t, q, p):
+    pull = -(1 + np.cos(t) / 2) * np.array([2 * q[0], 0, 2])
+    return np.concatenate([pull, np.cross(p[3:], p[3:] / _INERTIA)])
+
+
+def _hanging_react(t, q, p, force):
+    last, omega = np.append(q[4:], q[3]), p[3:] / _INERTIA  # as SciPy has quaternions
+    R = scipy.spatial.transform.Rotation.from_quat(last).as_matrix()
+    turns = [R @ np.cross(e, _ARM) for e in np.eye(3)]
+    slopes = np.concatenate([np.eye(3), np.stack(turns, axis=1)], axis=1)
+    change = R @ np.cross(omega, np.cross(omega, _ARM))
+    return _reaction(slopes, np.linalg.inv(_FLOATING), change, force)
+
+
+def _form(t, q, args):
+    return (1 + jnp.cos(t) / 2) * (q[0] ** 2 + q[1] * q[2] - q[2]) / 2
+
+
+def _form_force(t, q, p):
+    slope = np.array([2 * q[0], q[2], q[1] - 1])
+    force = -(1 + np.cos(t) / 2) * slope / 2
+    return force - (q @ force + p @ p) * q
+
+
+_INERTIA, _ARM = np.array([1.0, 1.5, 2.5]), np.array([0.3, -0.2, 0.5])
+_FLOATING = np.diag([2.0, 2.0, 2.0, *_INERTIA])
+_VECTOR, _SPIN = np.array([0.6, 0.3, -0.8]), np.array([0.3, -0.8, 0.6])
+_TURNED = np.array([0.9, 0.3, -0.2, 0.1])
+_HANGING = (-_ARM, _TURNED), (_SPIN, _SPIN)
+_FOLDED = _flat([[1.0, 0.3], [1.5, -0.6]], [[0.4, 0.5], [0.2, -0.4]])
+_masses = _quadratic(np.array([[1.0], [1.5]]))
+
 SYSTEMS = [
     System(
         *("pendulum", _mechanical(_quadratic(), _pendulum), _own, _pendulum_force),
@@ -371,6 +494,36 @@ SYSTEMS = [
         *("own split", _split, _own, lambda t, q, p: -(q**3)),
         *(*_TWO, frozenset({"any", "nystrom"}), "rates"),
     ),
+    System(
+        *("rods", _constrained(_mechanical(_masses, _rods_potential), _rods)),
+        *(_inverse(_MASSES), _rods_force, *_FOLDED, frozenset({"any"}), "all"),
+        *(_MASSES, True),
+        constrained=True,
+        react=_rods_react,
+    ),
+    System(
+        *("rigid body", _manifold(dps.Attitude(_INERTIA), _top)),
+        *(_top_velocity, _top_force, _TURNED, _SPIN, frozenset({"any"}), "time"),
+        mass=np.diag(_INERTIA),
+        constrained=True,
+    ),
+    System(
+        *("hanging body",),
+        _constrained(
+            _manifold((dps.Euclidean(2.0), dps.Attitude(_INERTIA)), _hanging_potential),
+            _joint,
+        ),
+        *(_hanging_velocity, _hanging_force, *_HANGING, frozenset({"any"}), "time"),
+        mass=_FLOATING,
+        constrained=True,
+        slow=True,
+        react=_hanging_react,
+    ),
+    System(
+        *("sphere", _manifold(dps.Sphere(), _form), _own, _form_force),
+        *(_VECTOR, _SPIN, frozenset({"any"}), "time"),
+        constrained=True,
+    ),
 ]
 
 
@@ -406,7 +559,7 @@ def _rates(system):
 
 def _shaped(system, numbers):
     """Numbers for the entries of a state as the package takes them."""
-    return jax.tree.map(jnp.asarray, ravel_pytree(system.q)[1](jnp.asarray(numbers)))
+    return jax.tree.map(jnp.asarray, ravel_pytree(system.p)[1](jnp.asarray(numbers)))
 
 
 def _matrix(system, skew=False):
@@ -414,7 +567,7 @@ def _matrix(system, skew=False):
     n = system.size
     full = 0.5 * np.eye(n) if not skew else np.zeros((n, n))
     offset = 0
-    for x in jax.tree.leaves(system.q):
+    for x in jax.tree.leaves(system.p):
         for _ in range(x.size // x.shape[-1]):
             for i in range(offset, offset + x.shape[-1] - 1):
                 full[i, i + 1] += 0.6 if skew else 0.2
@@ -426,7 +579,7 @@ def _matrix(system, skew=False):
 def _as_forms(system, full):
     """A block-diagonal matrix as one matrix for each vector of each leaf."""
     forms, offset = [], 0
-    leaves, structure = jax.tree.flatten(system.q)
+    leaves, structure = jax.tree.flatten(system.p)
     for x in leaves:
         d, blocks = x.shape[-1], []
         for _ in range(x.size // d):
@@ -437,7 +590,7 @@ def _as_forms(system, full):
 
 
 def _operator(system):
-    full, like = jnp.asarray(_matrix(system)), jax.tree.map(jnp.asarray, system.q)
+    full, like = jnp.asarray(_matrix(system)), jax.tree.map(jnp.asarray, system.p)
     unravel = ravel_pytree(like)[1]
     product = lambda v: unravel(
         full.astype(ravel_pytree(v)[0].dtype) @ ravel_pytree(v)[0]
@@ -465,7 +618,7 @@ def _place_matrix(system):
 
 def _drag_numpy(system, v, c=0.4, k=2.0):
     out, offset = [], 0
-    for x in jax.tree.leaves(system.q):
+    for x in jax.tree.leaves(system.p):
         for _ in range(x.size // x.shape[-1]):
             body = v[offset : offset + x.shape[-1]]
             out.append(-c * np.linalg.norm(body) ** (k - 1) * body)
@@ -849,13 +1002,19 @@ def offered(system: System, friction: Friction) -> frozenset[str] | Refused:
         return Refused("its own friction")
     if system.takes == "one rate" and kind != "one rate":
         return Refused("one rate")
+    if system.constrained and friction.external is not None:
+        return Refused("not by a force of the velocity")
+    if system.takes == "time" and kind in ("place", "drag"):
+        return Refused("not of time alone")
+    if system.takes == "time" and system.mass is None and kind != "one rate":
+        return frozenset()
     if system.takes == "joints":
         return Refused("not of joints") if friction.needs == "bodies" else frozenset()
     if friction.needs == "mass" and system.takes == "velocities":
         kind = "force"
     elif friction.needs and system.mass is None:
         return Refused("no mass")
-    if friction.name == "operator" and np.shape(system.q) != (system.size,):
+    if friction.name == "operator" and np.shape(system.p) != (system.size,):
         return Refused("not one vector")
     if friction.needs == "bodies" and not system.bodies:
         return frozenset()  # without a closed form, it is a force
@@ -876,6 +1035,8 @@ def claim(
         return splits
     if scheme.needs is not None and scheme.needs not in splits:
         return Refused(f"no split of kind {scheme.needs}")
+    if scheme.needs is None and system.constrained:
+        return Refused("leaves the manifold")
     if wrapper.composes and not scheme.composable:
         return Refused("not a base of compositions")
     order = scheme.order
@@ -906,14 +1067,19 @@ def fails(system: System, friction: Friction, scheme: Scheme, wrapper: Wrapper) 
 def reference(system: System, friction: Friction):
     """The solution as a function of time, by SciPy on the bare equations."""
     t0, t1 = span(system, friction)
-    n = system.size
+    n = ravel_pytree(system.q)[0].size
 
     def field(t, y):
         q, p = y[:n], y[n:]
         v, force = system.velocity(t, q, p, friction.eta(t)), system.force(t, q, p)
         if friction.limit is not None and t == 0:
-            return np.concatenate([v, friction.limit(system, force)])
-        return np.concatenate([v, force + friction.force(system, t, q, p, v)])
+            force = friction.limit(system, force)
+        else:
+            speed = v if n == p.size else np.linalg.solve(system.mass, p)
+            force = force + friction.force(system, t, q, p, speed)
+        if system.react is not None:
+            force = system.react(t, q, p, force)
+        return np.concatenate([v, force])
 
     ends = [t0, *([] if friction.kink is None else [friction.kink]), t1]
     pieces, y = [], ravel_pytree(start(system, friction))[0]
@@ -947,7 +1113,16 @@ def span(system: System, friction: Friction) -> tuple[float, float]:
 def start(system: System, friction: Friction):
     """The initial state: at rest where friction is singular."""
     rest = 0.0 if friction.limit is not None else 1.0
-    return system.q, jax.tree.map(lambda p: rest * p, system.p)
+    return _start(system, span(system, friction)[0], rest)
+
+
+@functools.cache
+def _start(system: System, t0: float, scale: float):
+    y0 = system.q, jax.tree.map(lambda p: scale * p, system.p)
+    if not system.constrained:
+        return y0
+    y0 = system.build(()).project(t0, jax.tree.map(jnp.asarray, y0))
+    return jax.tree.map(np.asarray, y0)
 
 
 # Ways to run.
@@ -1153,9 +1328,7 @@ PRECISIONS = ["float64", "float32"]
 ELSEWHERE = {
     "StepDensityController",  # step_density
     *("ChosenStep", "FixedStepAdjoint", "StepsBetween"),  # choose_step, adjoint
-    # Random neighbours of their states, as gradients here take, are not states.
-    "ConstrainedSystem",  # constrained
-    *("Attitude", "Euclidean", "ManifoldSystem", "Sphere", "Stiefel"),  # manifolds
+    "Stiefel",  # manifolds
     "MirrorMap",  # bregman
     *("Splitting", "SplittingTableau"),  # tableaus
 }

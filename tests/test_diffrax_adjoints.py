@@ -14,7 +14,8 @@ import diffrax_presym as dps
 
 NONE, *LAWS = [x for x in catalogue.FRICTION if x.limit is None and x.kink is None]
 BODIES = next(x for x in catalogue.SYSTEMS if x.name == "bodies")
-PAIRS = [(s, NONE) for s in catalogue.SYSTEMS]
+# Without those that collocation would leave the manifold of.
+PAIRS = [(s, NONE) for s in catalogue.SYSTEMS if not s.constrained]
 PAIRS += [(BODIES, x) for x in LAWS if x.name != "operator"]
 ADJOINTS = {
     "BacksolveAdjoint": dfx.BacksolveAdjoint(solver=dfx.Dopri8()),
