@@ -49,3 +49,18 @@ def test_a_move_that_prepares_is_prepared_for_each_stage_by_default():
     assert not own.DrivenKick().is_autonomous(system)
     assert own.SpringKick(1.0).is_autonomous(system)
     assert extend.Drift("any", 2).is_autonomous(system)
+
+
+def test_fields_of_friction_at_a_place_may_be_numbers():
+    system = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), lambda t, q, args: q[0], own.CubicDrag(0.3)
+    )
+    ends = [
+        dfx.diffeqsolve(
+            *(system, dps.Strang(), 0.0, 1.0, 0.1, (jnp.zeros(2), jnp.ones(2))),
+            adjoint=adjoint,
+        ).ys
+        for adjoint in (dps.FixedStepAdjoint(), dfx.RecursiveCheckpointAdjoint())
+    ]
+    for x, y in zip(*map(jax.tree.leaves, ends), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-14)

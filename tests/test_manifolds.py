@@ -403,5 +403,11 @@ def test_arguments():
     entries = dps.ConstantDamping(jnp.array([0.1, 0.2, 0.3]))
     rough = dps.ManifoldSystem(dps.Sphere(), flat, entries)
     y0 = jnp.array([1.0, 0.0, 0.0]), jnp.zeros(3)
-    with pytest.raises(ValueError, match="must be at one rate"):
-        diffeqsolve(rough, dps.Strang(), 0.0, 1.0, 0.1, y0)
+    held = dps.ConstrainedSystem(rough, lambda t, q, args: q[:1])
+    for system, solver in (
+        (rough, dps.Strang()),
+        (rough, dfx.Tsit5()),
+        (held, dps.Strang()),
+    ):
+        with pytest.raises(ValueError, match="must be at one rate"):
+            diffeqsolve(system, solver, 0.0, 1.0, 0.1, y0)

@@ -33,11 +33,11 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     steps differ by more than a factor of two (`diffrax.StepTo`) or of 1.5
     (`StepDensityController`), and where friction over a step is more than 0.5. The
     statistics say which, `sol.stats["interpolated"]`: with `StepDensityController` each
-    saved time has its own way, and this is whether any is interpolated. A solve whose final or saved states are not finite
-    fails; of an explicit scheme it ends at the next saved time or end of a step that is
-    used for one, as other steps are not checked. For a time of `SaveAt(ts=...)` that is
-    NaN, a gap in measured times, nothing is saved: the row stays infinite, as do rows
-    after the end of a solve.
+    saved time has its own way, and this is whether any is interpolated. A solve whose
+    final or saved states are not finite fails; of an explicit scheme it ends at the
+    next saved time or end of a step that is used for one, as other steps are not
+    checked. For a time of `SaveAt(ts=...)` that is NaN, a gap in measured times,
+    nothing is saved: the row stays infinite, as do rows after the end of a solve.
 
     For every solver of this package, with `diffrax.ConstantStepSize`, `StepsBetween`,
     `diffrax.StepTo` or `StepDensityController`, and any `SaveAt` but dense output, and
@@ -105,6 +105,8 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     ):
         del passed_solver_state
         y, carry, made_jump, meter, control = private.start_of(init_state)
+        # Of friction at a place it has the user's objects, whose fields may be numbers.
+        carry = jtu.tree_map(jnp.asarray, carry)
         system = bind(terms, args, y)
         unsupported = event, saveat, passed_controller_state
         _check(solver, stepsize_controller, *unsupported)

@@ -13,6 +13,7 @@ from jaxtyping import PyTree
 from .. import _tree as tree
 from .._checks import check_callable, describe
 from .._friction._base import AbstractFriction, Mechanics
+from .._friction._linear import LinearFriction
 from .._numbers import as_time, Scalar, State, Time
 from ._base import AbstractSystem, P, Q
 from ._constrained_split import ConstrainedSplit
@@ -122,6 +123,9 @@ class ConstrainedSystem(AbstractSystem):
     @property
     def mechanics(self) -> Mechanics:
         return self.system.mechanics
+
+    def fit_friction(self, p: P) -> LinearFriction | None:
+        return self.system.fit_friction(p)
 
     def check_state(self, y: PyTree) -> None:
         self.system.check_state(y)

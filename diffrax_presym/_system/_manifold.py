@@ -15,6 +15,8 @@ from .._compositions import lengths
 from .._forms import divide
 from .._friction._base import AbstractFriction, MASS, Mechanics
 from .._friction._damping import as_laws
+from .._friction._fit import fit_friction
+from .._friction._linear import LinearFriction
 from .._numbers import cast_to, Scalar, State, Time
 from ._base import AbstractSystem, P, Q
 from ._bound import System
@@ -142,6 +144,16 @@ class ManifoldSystem(AbstractSystem):
         self.check_state(y)
         return self.pair(self._each("project", *y))
 
+    def fit_friction(self, p: P) -> LinearFriction | None:
+        friction = fit_friction(self.parts.linear, self.mechanics, p)
+        if friction is not None and not (self.is_free or friction.is_one_rate):
+            raise ValueError(
+                "Friction on a `Sphere` or a `Stiefel` must be at one rate. Write "
+                "`ConstantDamping(rate)` with a number, or a pytree of numbers for "
+                "several manifolds."
+            )
+        return friction
+
     # The vector field.
 
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
@@ -223,14 +235,5 @@ class ManifoldSplit(AbstractSplit):
 
 
 def _only_shortens(system: System) -> bool:
-    """Whether friction is at one rate for each manifold, so that it changes how far a
-    motion goes and not where; `ValueError` if it has to be."""
-    if system.friction is None or system.friction.is_one_rate:
-        return True
-    if not system.term.is_free:
-        raise ValueError(
-            "Friction on a `Sphere` or a `Stiefel` must be at one rate. Write "
-            "`ConstantDamping(rate)` with a number, or a pytree of numbers for several "
-            "manifolds."
-        )
-    return False
+    """Whether friction changes how far a motion goes, and not where."""
+    return system.friction is None or system.friction.is_one_rate
