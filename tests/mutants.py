@@ -294,24 +294,10 @@ MUTANTS = [
     ),
     Mutant(
         "a row of variable steps is found in the step before",
-        "_loop/_variable_rows.py",
-        "jnp.where(gap, n, first + jnp.sum(ends <= t) - 1)",
-        "jnp.where(gap, n, first + jnp.sum(ends <= t) - 2)",
-        tests="test_variable_saved.py",
-    ),
-    Mutant(
-        "interpolated values do not depend on the times of variable steps in gradients",
-        "_loop/_nodes.py",
-        "if self.slopes is not None:",
-        "if False:",
-        tests="test_variable_saved.py",
-    ),
-    Mutant(
-        "variable steps are interpolated beside a singularity",
-        "_loop/_nodes.py",
-        "_MOST_RATIO_FOLLOWED = 1.5",
-        "_MOST_RATIO_FOLLOWED = 1.5e3",
-        tests="test_variable_saved.py",
+        "_loop/_variable.py",
+        "found = stops.at[j].set(n), insides.at[j].set(inside)",
+        "found = stops.at[j].set(n - 1), insides.at[j].set(inside)",
+        tests="test_step_density.py",
     ),
     Mutant(
         "stages of collocation by the momenta of the last round",

@@ -30,14 +30,13 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     steps, which takes no step of the scheme. Where that cannot follow the motion, it is
     a shorter step: of schemes up to order two, of `TunedLinear8`, of systems with
     constraints or on manifolds, in spans of fewer than three steps, where neighbouring
-    steps differ by more than a factor of two (`diffrax.StepTo`) or of 1.5
-    (`StepDensityController`), and where friction over a step is more than 0.5. The
-    statistics say which, `sol.stats["interpolated"]`: with `StepDensityController` each
-    saved time has its own way, and this is whether any is interpolated. A solve whose
-    final or saved states are not finite fails; of an explicit scheme it ends at the
-    next saved time or end of a step that is used for one, as other steps are not
-    checked. For a time of `SaveAt(ts=...)` that is NaN, a gap in measured times,
-    nothing is saved: the row stays infinite, as do rows after the end of a solve.
+    steps of `diffrax.StepTo` differ by more than a factor of two, where friction over a
+    step is more than 0.5, and with `StepDensityController`. The statistics say which,
+    `sol.stats["interpolated"]`. A solve whose final or saved states are not finite
+    fails; of an explicit scheme it ends at the next saved time or end of a step that is
+    used for one, as other steps are not checked. For a time of `SaveAt(ts=...)` that is
+    NaN, a gap in measured times, nothing is saved: the row stays infinite, as do rows
+    after the end of a solve.
 
     For every solver of this package, with `diffrax.ConstantStepSize`, `StepsBetween`,
     `diffrax.StepTo` or `StepDensityController`, and any `SaveAt` but dense output, and
@@ -132,8 +131,8 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
             (progress_meter, meter),
             reversal=isinstance(way, Reversal),
         )
-        final, interpolated = _final_state(problem, way, init_state, structure)
-        about = {"order": solver.order(terms), "interpolated": interpolated}
+        final = _final_state(problem, way, init_state, structure)
+        about = {"order": solver.order(terms), "interpolated": problem.interpolates}
         return final, about
 
     def _way(
@@ -227,11 +226,11 @@ def _final_state(problem: Problem, way: Reversal | Checkpoints, init_state, stru
     out = _solve((problem, buffers), way)
     out, counts = eqx.partition(out, eqx.is_inexact_array)
     # To JAX all outputs of a custom rule have derivatives, even integers.
-    end, saved, n, result, meter, interpolated = eqx.combine(
+    end, saved, n, result, meter = eqx.combine(
         out, eqxi.nondifferentiable_backward(counts)
     )
     carry, control = problem.steps.split(end[1])
-    final = private.final_state(
+    return private.final_state(
         init_state,
         structure,
         y=end[0],
@@ -243,7 +242,6 @@ def _final_state(problem: Problem, way: Reversal | Checkpoints, init_state, stru
         meter=meter,
         saved=saved,
     )
-    return final, interpolated
 
 
 @eqx.filter_custom_vjp
@@ -257,8 +255,7 @@ def _outputs(problem: Problem, buffers, out):
     (progress, result, values), trace = out
     each = zip(trace.rows, buffers, values, strict=True)
     saved = [saved_rows(problem, i, *x, progress) for i, x in enumerate(each)]
-    interpolated = problem.interpolated(trace.found)
-    return progress.point, saved, progress.n, result, progress.meter, interpolated
+    return progress.point, saved, progress.n, result, progress.meter
 
 
 @_solve.def_fwd

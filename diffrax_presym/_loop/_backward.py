@@ -10,12 +10,12 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, Int, PyTree
+from jaxtyping import Array, Int, PyTree
 
 from .. import _tree as tree
 from .._numbers import State
 from .._scheme._base import Point
-from ._nodes import Found, NODES
+from ._nodes import NODES, Stencils
 from ._problem import Functions, Problem
 from ._run import end_is_separate, Trace
 from ._tracks import put, stack
@@ -91,15 +91,12 @@ class Backward(eqx.Module):
 
     @property
     def tracks(self) -> list["AbstractPull"]:
-        tracks, pairs = [], zip(self.problem.rows, self.trace.found, strict=True)
-        for i, (rows, found) in enumerate(pairs):
-            taken = rows.taken(self.trace.n)
-            if found is not None and found.weights is not None:
-                between = taken & found.is_interpolated
-                tracks.append(PullNodes(i, _up_to(between), found))
-                taken &= ~between
-            if len(rows):
-                tracks.append(PullRows(i, _up_to(taken), rows.stop))
+        problem, tracks = self.problem, []
+        for i, (rows, stencils) in enumerate(
+            zip(problem.rows, problem.stencils, strict=True)
+        ):
+            tracks += [PullRows(i, rows.stop)] if len(rows) else []
+            tracks += [] if stencils is None else [PullNodes(i, stencils)]
         return tracks
 
     def start(self, at: BackwardState) -> BackwardState:
@@ -176,8 +173,6 @@ class AbstractPull(eqx.Module):
     """How what a track collected is pulled back, on the way back."""
 
     i: int = eqx.field(static=True)  # the output
-    # Of so many rows, how many there are up to the last that is pulled back.
-    up_to: Int[Array, " rows+1"]
 
     @abc.abstractmethod
     def start(self, backward: Backward) -> PyTree:
@@ -195,21 +190,29 @@ class AbstractPull(eqx.Module):
 
 
 class PullRows(AbstractPull):
-    """Values at steps, or of shorter ones from there; the state is the number of rows
-    that are left."""
+    """Values at steps, or of shorter ones from there; the state is their number."""
 
     stops: Array
 
     def start(self, backward):
-        return self.up_to[-1]
+        problem, i = backward.problem, self.i
+        number = jnp.sum(problem.rows[i].reached(backward.trace.n))
+        stencils = problem.stencils[i]
+        return (
+            number if stencils is None else jnp.where(stencils.ways.others, number, 0)
+        )
 
     def due(self, state, n):
-        return jnp.where(state > 0, self.stops[state - 1], -1)
+        stop = self.stops[state - 1]
+        return jnp.where(state > 0, jnp.where(stop < 0, n, stop), -1)
 
     def pull(self, backward, at, state):
         i, j, problem = self.i, state - 1, backward.problem
-        rows, left = problem.rows[i], self.up_to[j]
-        bar = backward.row(i, int(problem.subs[i].t0) + j, state > 0)
+        rows = problem.rows[i]
+        taken = rows.stop[j] >= 0
+        if (stencils := problem.stencils[i]) is not None:
+            taken &= ~stencils.ways.interpolated
+        bar = backward.row(i, int(problem.subs[i].t0) + j, taken)
 
         def pull(shorter: bool):
             def output(functions: Functions, start: Point):
@@ -218,54 +221,51 @@ class PullRows(AbstractPull):
             return backward.pull(output, bar, at.point)
 
         if not rows.may_be_inside:
-            return at.add(*pull(False)), left
+            return at.add(*pull(False)), j
         # Decided before the derivative is taken: in a batch, JAX would differentiate
         # the branch that is not taken at zeros, where an implicit step is singular.
         pulled = lax.cond(rows.inside[j], lambda: pull(True), lambda: pull(False))
-        return at.add(*pulled), left
+        return at.add(*pulled), j
 
 
 class PullNodes(AbstractPull):
     """Values between steps, by the cotangents of the last few nodes."""
 
-    found: Found
+    stencils: Stencils
 
     def start(self, backward):
         n, node = backward.trace.n, (backward.trace.end[0],) * 3
-        ring = stack((backward.problem.steps.t0, node), NODES)
-        return n + 1, n + 1, self.up_to[-1], _zeros(ring)
-
-    def _last(self, number: Array) -> Array:
-        """The last node of the last of so many rows."""
-        last = self.found.first[number - 1] + NODES - 1
-        return jnp.where(number > 0, last, -1)
+        number, _ = backward.trace.between[self.i]
+        return n + 1, n + 1, number, _zeros(stack(node, NODES))
 
     def due(self, state, n):
-        node, low, number, _ = state
-        return jnp.where(node > low, node - 1, self._last(number))
+        node, low, j, _ = state
+        last = self.stencils.last[j - 1]
+        row = jnp.where(j > 0, jnp.where(last < 0, n, last), -1)
+        return jnp.where(node > low, node - 1, row)
 
     def pull(self, backward, at, state):
         problem, i, n = backward.problem, self.i, at.n
         rows, start = problem.rows[i], problem.start[0]
 
         def spread(x):
-            gradient, _, number, bars = x
-            taken, j = number > 0, number - 1
+            gradient, low, j, bars = x
+            j = j - 1
+            taken = (rows.stop[j] >= 0) & self.stencils.ways.interpolated
             bar = backward.row(i, int(problem.subs[i].t0) + j, taken)
             # Of the others nothing may fail of which a gradient takes zero times.
             time = jnp.where(taken, rows.time[j], problem.steps.t0)
-            y = jtu.tree_map(lambda x: x[j], self.found.state)
+            y = jtu.tree_map(lambda x: x[j], backward.trace.between[i][1])
             y = tree.where(taken, y, start)
             output = lambda functions, y: functions.outputs[i](time, y)
             more, bar = backward.pull(output, bar, y)
-            bars, gradient = (
-                self.found.spread(j, bar, bars),
-                tree.sum(gradient, more),
-            )
-            return gradient, self.found.first[j], self.up_to[j], bars
+            bars = self.stencils.spread(j, bar, bars)
+            low = jnp.where(rows.stop[j] >= 0, self.stencils.first[j], low)
+            return tree.sum(gradient, more), low, j, bars
 
         def unspread(x):
-            return self._last(x[2]) >= n
+            last = self.stencils.last[x[2] - 1]
+            return (x[2] > 0) & ((last < 0) | (last >= n))
 
         def pull(side: Array, at: BackwardState, bars: PyTree):
             node = lambda functions, point: functions.node(n, side, point)
@@ -273,24 +273,18 @@ class PullNodes(AbstractPull):
             at = at.add(*backward.pull(node, bar, at.point))
             return at, put(bars, n % NODES, _zeros(bar))
 
-        _, low, number, bars = state
+        _, low, j, bars = state
         kink, kinks = jnp.zeros((), int), problem.steps.kinks
         if kinks is not None:
             kink = jnp.any(kinks == n).astype(int)
             after = lambda: pull(kink, at, bars)
             at, bars = lax.cond(kink == 1, after, lambda: (at, bars))
-        gradient, low, number, bars = lax.while_loop(
-            unspread, spread, (at.gradient, low, number, bars)
+        gradient, low, j, bars = lax.while_loop(
+            unspread, spread, (at.gradient, low, j, bars)
         )
         at = eqx.tree_at(lambda at: at.gradient, at, gradient, is_leaf=_is_none)
         at, bars = pull(-kink, at, bars)
-        return at, (n, low, number, bars)
-
-
-def _up_to(pulled: Bool[Array, " rows"]) -> Int[Array, " rows+1"]:
-    """Of so many rows, how many there are up to the last that is pulled back."""
-    numbers = jnp.where(pulled, jnp.arange(1, len(pulled) + 1), 0)
-    return jnp.append(jnp.zeros((), int), lax.cummax(numbers))
+        return at, (n, low, j, bars)
 
 
 _is_none = lambda x: x is None

@@ -15,7 +15,7 @@ from ._backward import Backward, BackwardState
 from ._base import MOST_STEPS
 from ._problem import Problem
 from ._tracks import AbstractTrack, Track
-from ._variable_rows import Kept
+from ._variable import Kept
 
 
 # The least number of steps between two kept states, of a gradient by reversal.

@@ -5,7 +5,6 @@ time, the nodes, and their first two derivatives along the motion.
 """
 
 import math
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,7 +17,6 @@ from .. import _tree as tree
 from .._numbers import cast_to, State
 from .._scheme._base import Point, Scheme
 from .._system._bound import System
-from ._base import MOST_STEPS
 from ._rows import Rows
 from ._steps import Steps
 
@@ -29,16 +27,17 @@ NODES = 4  # of a polynomial
 _MOST_FRICTION = 0.5
 # The largest ratio of neighbouring steps.
 _MOST_RATIO = 2.0
-# The same of steps that follow the motion: steps each of which is two thirds of the one
-# before end after three, so that a singularity may be between the nodes.
-_MOST_RATIO_FOLLOWED = 1.5
 
 # A state and its first two derivatives.
 Node = tuple[State, State, State]
 
 
-def derivatives(scheme: Scheme, system: System, t: Array, point: Point) -> Node:
-    """The state at a time of the solve, and its first two derivatives in that time."""
+def derivatives(
+    scheme: Scheme, system: System, t: Array, side: Array, point: Point
+) -> Node:
+    """The state at a time of the solve, and its first two derivatives in that time:
+    where they jump, those before it (-1) or after it (1)."""
+    t = jnp.nextafter(t, t + cast_to(side, t))
     y, force = system.values(point[0]), scheme.end_force(point[1])
 
     def slope(t: Array, y: State, force: PyTree = None) -> State:
@@ -47,19 +46,6 @@ def derivatives(scheme: Scheme, system: System, t: Array, point: Point) -> Node:
 
     first = slope(t, y, force)
     return y, first, jax.jvp(slope, (t, y), (jnp.ones_like(t), first))[1]
-
-
-def is_smooth(system: System, ends: Float[Array, " nodes"]) -> Bool[Array, ""]:
-    """Whether interpolation can follow the motion between nodes of these times."""
-    lengths, friction = jnp.diff(ends), system.friction
-    short = jnp.minimum(lengths[1:], lengths[:-1])
-    long = jnp.maximum(lengths[1:], lengths[:-1])
-    smooth = jnp.all(long <= _MOST_RATIO_FOLLOWED * short)
-    if friction is None:
-        return smooth
-    t0, t1 = system.time(ends[0]), system.time(ends[-1])
-    growth = friction.growth(jnp.minimum(t0, t1), jnp.abs(t1 - t0))
-    return smooth & (lax.stop_gradient(growth) <= _MOST_FRICTION * (NODES - 1))
 
 
 class Ways(eqx.Module):
@@ -103,7 +89,7 @@ class Stencils(eqx.Module):
             nodes = [float(i) for i in range(NODES)]
         else:
             nodes = [(steps.time(first + i) - begin) / unit for i in range(NODES)]
-        self.weights = weights_of(s, nodes, unit)
+        self.weights = _weights(s, nodes, unit)
         self.ways, due = ways, ways.some & rows.reached(last)
         # A gap in measured times is saved at once, whatever it is.
         first = jnp.where(rows.stop < 0, -NODES, jnp.where(due, first, last + 1))
@@ -118,69 +104,32 @@ class Stencils(eqx.Module):
         here = self.ways.interpolated & (rows.stop >= 0)
         return jnp.where(here, self.last[:-1], rows.known)
 
-    def found(self, rows: Rows, number: Array, state: State | None) -> "Found":
-        """How the first so many rows were computed, and the states in them."""
-        here = self.ways.interpolated & (jnp.arange(len(rows)) < number)
-        first = jnp.where(here & (rows.stop >= 0), self.first[:-1], MOST_STEPS)
-        return Found(rows.stop, rows.inside, first, self.weights, state)
+    def combine(self, j: Array, ring: Node) -> State:
+        """The state in row `j`, from a ring of nodes."""
 
+        def leaf(*data: Array) -> Array:
+            total = jnp.zeros(data[0].shape[1:], data[0].dtype)
+            for i in range(NODES):
+                for order, x in enumerate(data):
+                    weight = cast_to(self.weights[j, i, order], x)
+                    total = total + weight * x[(self.first[j] + i) % NODES]
+            return total
 
-class Found(NamedTuple):
-    """Of a row, the step in which it is, and how its value was computed."""
+        return jtu.tree_map(leaf, *ring)
 
-    stop: Int[Array, "..."]
-    inside: Bool[Array, "..."]  # whether it is inside of the step, or at its start
-    # The first node if it is interpolated, or a step that is never reached.
-    first: Int[Array, "..."]
-    # What a gradient needs of one that is interpolated.
-    weights: Float[Array, "... nodes 3"] | None = None
-    state: State | None = None
-    slopes: PyTree | None = None  # derivatives of the state by the times of the nodes
-
-    @classmethod
-    def nowhere(cls) -> "Found":
-        """Of one that has not been reached."""
-        never = jnp.asarray(MOST_STEPS)
-        return cls(never, jnp.asarray(True), never)
-
-    @property
-    def is_interpolated(self) -> Bool[Array, "..."]:
-        return self.first < MOST_STEPS
-
-    def spread(self, j: Array, bar: State, ring: tuple[Array, Node]):
-        """The cotangents of the times and the data of the nodes of row `j`, added to a
-        ring of these."""
-        assert self.weights is not None
-        (times, nodes), place = ring, (jnp.arange(NODES) - self.first[j]) % NODES
-        weights = self.weights[j, place]
+    def spread(self, j: Array, bar: State, ring: Node) -> Node:
+        """The transpose: the cotangents of the nodes, added to a ring of these."""
+        place = (jnp.arange(NODES) - self.first[j]) % NODES
 
         def leaf(order: int, x: Array, bar: Array) -> Array:
-            weight = cast_to(weights[:, order], bar)
-            return x + weight.reshape(-1, *(1,) * bar.ndim) * bar[None]
+            weights = cast_to(self.weights[j, place, order], bar)
+            return x + weights.reshape(-1, *(1,) * bar.ndim) * bar[None]
 
-        one = lambda order: jtu.tree_map(lambda *x: leaf(order, *x), nodes[order], bar)
-        if self.slopes is not None:
-            by_time = lambda b, x: jnp.tensordot(b, cast_to(x[j], b), b.ndim)
-            for x in jtu.tree_leaves(jtu.tree_map(by_time, bar, self.slopes)):
-                times = times + cast_to(x, times)[place]
-        return times, (one(0), one(1), one(2))
+        one = lambda order: jtu.tree_map(lambda *x: leaf(order, *x), ring[order], bar)
+        return one(0), one(1), one(2)
 
 
-def combine(weights: Float[Array, "nodes 3"], first: Array, ring: Node) -> State:
-    """A state from a ring of nodes."""
-
-    def leaf(*data: Array) -> Array:
-        total = jnp.zeros(data[0].shape[1:], data[0].dtype)
-        for i in range(NODES):
-            for order, x in enumerate(data):
-                weight = cast_to(weights[i, order], x)
-                total = total + weight * x[(first + i) % NODES]
-        return total
-
-    return jtu.tree_map(leaf, *ring)
-
-
-def weights_of(s: Float[Array, "*rows"], nodes: list, unit: Array) -> Array:
+def _weights(s: Array, nodes: list, unit: Array) -> Array:
     """The weights of value, first and second derivative at each node."""
     weights = []
     for i, node in enumerate(nodes):
@@ -197,4 +146,4 @@ def weights_of(s: Float[Array, "*rows"], nodes: list, unit: Array) -> Array:
             (d * unit) ** 2 / 2 * cube,
         )
         weights.append(jnp.stack(each, axis=-1))
-    return jnp.stack(weights, axis=-2)
+    return jnp.stack(weights, axis=1)

@@ -1,7 +1,6 @@
 """A solve with steps known beforehand or reversible, as functions of states alone."""
 
 from collections.abc import Callable
-from functools import partial, reduce
 
 import diffrax as dfx
 import equinox as eqx
@@ -10,13 +9,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 
 from .. import _tree as tree
-from .._numbers import cast_to, Scalar, State
+from .._numbers import Scalar, State
 from .._results import NONFINITE
 from .._scheme._base import AbstractPresymplecticSolver, Point
 from .._scheme._engine import Result
 from .._system._bound import System
 from ._base import AbstractSteps
-from ._nodes import derivatives, Found, is_smooth, Node, NODES, Stencils, Ways
+from ._nodes import derivatives, Node, Stencils, Ways
 from ._rows import Rows
 from ._steps import Steps
 
@@ -31,9 +30,9 @@ class Functions(eqx.Module):
     step: Callable[[Array, Point], tuple[Point, Result]]
     # The state within a step, if any is saved.
     shorter: Callable[[Array, Point, Array], State] | None
-    # The start of a step, and the state and its first two derivatives there, if used:
-    # where they jump, those before it (-1) or after it (1).
-    node: Callable[[Array, Array, Point], tuple[Array, Node]] | None
+    # The state at the start of a step and its first two derivatives, if used, on a
+    # side of it.
+    node: Callable[[Array, Array, Point], Node] | None
     outputs: list[Callable[[Array, State], PyTree]]  # of `SaveAt(fn=...)`
 
 
@@ -45,8 +44,6 @@ class Problem(eqx.Module):
     undo: Callable[[Array, Point], Point] | None  # the inverse of a step
     # The result of so many steps to an end, from one without its reason.
     explain: Callable[[Array, Point, dfx.RESULTS], dfx.RESULTS]
-    # Whether interpolation can follow the motion between nodes of these times.
-    is_smooth: Callable[[Array], Bool[Array, ""]]
     growth: Scalar | None  # of rounding errors backwards in time, its logarithm
     steps: AbstractSteps
     rows: list[Rows]
@@ -87,17 +84,13 @@ class Problem(eqx.Module):
         self.stencils = [None] * len(self.rows)
         at_node = None
         resolved = scheme.is_resolved and solver.order(None) > 2
-
-        def node(n: Array, side: Array, point: Point) -> tuple[Array, Node]:
-            t, (y, carry) = steps.begin(n, point), point
-            if steps.kinks is not None:
-                t = jnp.nextafter(t, t + cast_to(side, t))
-            within = y, steps.split(carry)[0]
-            return t, derivatives(scheme, system, t, within)
-
-        if some and resolved:
-            at_node = convert(node, n, n, start)
-        if isinstance(steps, Steps) and at_node is not None:
+        if isinstance(steps, Steps) and some and resolved:
+            at_node = convert(
+                lambda n, side, point: derivatives(
+                    scheme, system, steps.time(n), side, point
+                ),
+                *(n, n, start),
+            )
             ways = Ways(system, steps, self.last)
             for i, rows in enumerate(self.rows):
                 if rows.may_be_inside:
@@ -112,7 +105,6 @@ class Problem(eqx.Module):
         within = convert(shorter, n, start, t0) if some else None
         self.functions = Functions(convert(step, n, start), within, at_node, outputs)
         self.start = start
-        self.is_smooth = convert(partial(is_smooth, system), jnp.zeros(NODES, t0.dtype))
         # Computed, so that it has the sharding of others within `jax.shard_map`.
         result = dfx.RESULTS.where(n < 0, NONFINITE, dfx.RESULTS.successful)
         self.explain = convert(explained, n, start, result)
@@ -126,13 +118,11 @@ class Problem(eqx.Module):
         self.subs = list(map(without_fn, subs))
         self.progress_meter, self.meter = meters
 
-    def interpolated(self, found: list[Found | None]) -> Bool[ArrayLike, ""]:
-        """Whether values between steps took no step, or some of them did not."""
+    @property
+    def interpolates(self) -> Bool[ArrayLike, ""]:
+        """Whether values between steps take no step."""
         stencils = [x for x in self.stencils if x is not None]
-        if stencils:
-            return stencils[0].ways.interpolated
-        each = [jnp.any(x.is_interpolated) for x in found if x is not None]
-        return reduce(jnp.logical_or, each, False)
+        return stencils[0].ways.interpolated if stencils else False
 
     @property
     def last(self) -> Int[Array, ""]:

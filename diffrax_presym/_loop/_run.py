@@ -6,7 +6,6 @@ one to the next without asking. Between steps the solution is interpolated from 
 of several, or a shorter step of the scheme.
 """
 
-from functools import partial
 from typing import Any
 
 import diffrax as dfx
@@ -21,12 +20,10 @@ from .._results import NONFINITE
 from .._scheme._base import Point
 from .._scheme._engine import cheap_iterations
 from ._base import MOST_STEPS, Stop
-from ._nodes import Found, NODES
 from ._problem import Problem
 from ._rows import Rows
-from ._tracks import AbstractTrack, Interpolated, put, stack, Track
-from ._variable import VariableSteps
-from ._variable_rows import Between, Timed
+from ._tracks import AbstractTrack, Interpolated, put, Track
+from ._variable import Timed
 
 
 # The steps of a loop whose length is known, for which the host does not wait on a GPU.
@@ -40,7 +37,7 @@ class Progress(eqx.Module):
     point: Point
     result: dfx.RESULTS | None  # `None` if no step can fail
     meter: PyTree
-    starts: Point | None  # of the last few steps, a ring, if these may be needed
+    before: Point | None  # the start of the last step, if that may be cut off
 
 
 class Trace(eqx.Module):
@@ -48,10 +45,10 @@ class Trace(eqx.Module):
 
     n: Int[Array, ""]
     end: Point
-    # How each row was computed, of each output, if any may be interpolated.
-    found: list[Found | None]
+    # The number of interpolated rows and the states in them, of each output.
+    between: list[PyTree]
     kept: PyTree  # the steps whose starting states are kept, and these
-    before: Point | None  # the start of the last step, if that may be cut off
+    before: Point | None  # as in `Progress`
     rows: list[Rows]  # of which the steps are known now
 
 
@@ -62,26 +59,26 @@ def run(problem: Problem, kept: AbstractTrack | None = None):
     tracks = [_tracks(problem, i, keep) for i in range(number)]
     progress, (stacked, kept_states) = _walk(problem, (tracks, kept))
 
-    saved, all_found, finite = [], [], tree.all_finite(progress.point[0])
+    saved, between, finite = [], [], tree.all_finite(progress.point[0])
     all_rows = []
     for i, (at_steps, inside) in enumerate(stacked):
-        values, found, rows = None, None, problem.rows[i]
+        values, ys, rows = None, None, problem.rows[i]
         if at_steps is not None:
             if not problem.steps.are_known:
                 found, at_steps = at_steps
-                rows = rows.found(found.stop, found.inside)
+                rows = rows.found(*found)
             values, each = at_steps
             good = jnp.all(each | ~rows.taken(progress.n))
             if inside is not None:
                 number, (new, ys), nodes = inside
+                ys = number, ys
                 stencils = problem.stencils[i]
                 assert stencils is not None
-                found = stencils.found(rows, number, ys)
                 way = stencils.ways.interpolated
                 values, good = tree.where(way, (new, nodes), (values, good))
             finite &= good
         saved.append(values)
-        all_found.append(found)
+        between.append(ys)
         all_rows.append(rows)
     success: Any = dfx.RESULTS.successful
     result = success if progress.result is None else progress.result
@@ -91,10 +88,8 @@ def run(problem: Problem, kept: AbstractTrack | None = None):
     ended = problem.steps.ended(progress.n, progress.point)
     short = (result == success) & ~ended
     result = dfx.RESULTS.where(short, dfx.RESULTS.max_steps_reached, result)
-    before = progress.starts
-    if before is not None:
-        before = jtu.tree_map(lambda x: x[(progress.n - 1) % (NODES - 1)], before)
-    trace = Trace(progress.n, progress.point, all_found, kept_states, before, all_rows)
+    before = progress.before
+    trace = Trace(progress.n, progress.point, between, kept_states, before, all_rows)
     return (progress, result, saved), trace
 
 
@@ -108,17 +103,11 @@ def _tracks(
         return None, None
     y, output = problem.start[0], functions.outputs[i]
     init, due = output(problem.steps.t0, y), rows.reached(problem.last)
-    if isinstance(problem.steps, VariableSteps):
-        if functions.node is None:
-            found = lambda j, n, inside, point: problem.output(
-                i, functions, j, point, found=(n, inside)
-            )
-            return Timed(rows.time, found, (init, jnp.asarray(True))), None
-        shorter = partial(problem.between, functions)
-        value = lambda j, y: output(rows.time[j], y)
-        do = problem.is_smooth, functions.node, shorter, value
-        times = rows.time, problem.steps, problem.last
-        return Between(*times, *do, y, init, keep), None
+    if not problem.steps.are_known:
+        found = lambda j, n, inside, point: problem.output(
+            i, functions, j, point, found=(n, inside)
+        )
+        return Timed(rows.time, found, (init, jnp.asarray(True))), None
     if stencils is not None:
         due &= stencils.ways.others
     value = lambda j, point: problem.output(i, functions, j, point)
@@ -136,20 +125,18 @@ def _tracks(
 def _walk(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
     """All steps, stopping where a value of a track is due."""
     steps, last, meter = problem.steps, problem.last, problem.progress_meter
-    # The last step may be cut off, which cannot be undone.
-    follows = tracks[1] is not None or problem.functions.node is not None
-    follows = follows and not steps.are_known
+    may_be_cut = not steps.are_known and tracks[1] is not None
 
     def step(progress: Progress) -> Progress:
         n, point = progress.n, progress.point
         end, result = problem.functions.step(n, point)
         done = (steps.begin(n + 1, end) - steps.t0) / (steps.t1 - steps.t0)
-        starts = put(progress.starts, n % (NODES - 1), point) if follows else None
-        return Progress(n + 1, end, result, meter.step(progress.meter, done), starts)
+        before = point if may_be_cut else None
+        return Progress(n + 1, end, result, meter.step(progress.meter, done), before)
 
-    starts = stack(problem.start, NODES - 1) if follows else None
+    before = problem.start if may_be_cut else None
     zero = jnp.zeros((), int)
-    start = Progress(zero, problem.start, None, problem.meter, starts)
+    start = Progress(zero, problem.start, None, problem.meter, before)
     can_fail = eqx.filter_eval_shape(step, start).result is not None
     if can_fail:
         success = jtu.tree_map(jnp.asarray, dfx.RESULTS.successful)
@@ -179,10 +166,9 @@ def _walk(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
         wanted = due(states)
         first, new = steps.next_stop(wanted, last), []
         progress = advance_to(first, progress)
-        at = steps.number(first, progress.n), progress.point, progress.starts
-        n, point, _ = at
+        n, point = steps.number(first, progress.n), progress.point
         for track, state, next_stop in zip(flat, states, wanted, strict=True):
-            visit = lambda track=track, state=state: track.visit(state, *at)
+            visit = lambda track=track, state=state: track.visit(state, n, point)
             here = steps.at(next_stop, n, point)
             new.append(lax.cond(here, visit, lambda state=state: state))
         return progress, new

@@ -14,7 +14,7 @@ from .. import _tree as tree
 from .._numbers import cast_to, State
 from .._scheme._base import Point
 from ._base import Stop
-from ._nodes import combine, Node, NODES, Stencils
+from ._nodes import Node, NODES, Stencils
 
 
 class AbstractTrack(eqx.Module):
@@ -32,11 +32,8 @@ class AbstractTrack(eqx.Module):
         """Where a state is wanted next."""
 
     @abc.abstractmethod
-    def visit(
-        self, state: PyTree, n: Array, point: Point, starts: Point | None
-    ) -> PyTree:
-        """The state after that, at the start of step `n`; with the starts of the steps
-        before, in a ring, if these may be needed."""
+    def visit(self, state: PyTree, n: Array, point: Point) -> PyTree:
+        """The state after that, at the start of step `n`."""
 
     @abc.abstractmethod
     def rows(self, state: PyTree) -> PyTree:
@@ -60,7 +57,7 @@ class Track(AbstractTrack):
     def due(self, state):
         return Stop(self.stops[state[0]])
 
-    def visit(self, state, n, point, starts):
+    def visit(self, state, n, point):
         j, rows = state
         return j + 1, put(rows, j, self.value(j, point))
 
@@ -73,7 +70,7 @@ class Interpolated(AbstractTrack):
 
     stencils: Stencils
     kinks: Int[Array, " kinks"] | None  # the steps before which derivatives jump
-    node: Callable[[Array, Array, Point], tuple[Array, Node]]
+    node: Callable[[Array, Array, Point], Node]
     value: Callable[[Array, State], PyTree]  # of the row and the state in it
     y: State  # any
     init: PyTree
@@ -88,23 +85,23 @@ class Interpolated(AbstractTrack):
         n, j, *_ = state
         return Stop(jnp.maximum(n, self.stencils.first[j]))
 
-    def visit(self, state, n, point, starts):
+    def visit(self, state, n, point):
         _, j, ring, rows, finite = state
         kink = jnp.zeros((), int)
         if self.kinks is not None:
             kink = jnp.any(self.kinks == n).astype(int)
-        _, node = self.node(n, -kink, point)
+        node = self.node(n, -kink, point)
         ring = put(ring, n % NODES, node)
 
         def save(x):
             j, rows = x
-            y = combine(self.stencils.weights[j], self.stencils.first[j], ring)
+            y = self.stencils.combine(j, ring)
             return j + 1, put(rows, j, self.value(j, y))
 
         complete = lambda x: self.stencils.last[x[0]] <= n
         j, rows = lax.while_loop(complete, save, (j, rows))
         if self.kinks is not None:
-            after = lambda: put(ring, n % NODES, self.node(n, kink, point)[1])
+            after = lambda: put(ring, n % NODES, self.node(n, kink, point))
             ring = lax.cond(kink == 1, after, lambda: ring)
         return n + 1, j, ring, rows, finite & tree.all_finite(node)
 

@@ -5,18 +5,22 @@ as one of a length that is known, and is undone and differentiated like it: with
 dependence of all steps on the states before them.
 """
 
+from collections.abc import Callable
 from functools import reduce
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
+import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import jax.tree_util as jtu
+from jaxtyping import Array, Bool, Float, PyTree
 
 from .. import _tree as tree
 from .._scheme._base import advance, check_step, Point
 from .._scheme._engine import backward, first_failure, prepare, Span
 from .._step_size._density import StepDensityController
 from ._base import AbstractSteps, MOST_STEPS, Stop
+from ._tracks import AbstractTrack, put, stack
 
 
 class Clock(NamedTuple):
@@ -130,3 +134,66 @@ class VariableSteps(AbstractSteps):
     def without_gradient(self):
         fixed = tree.stop_gradient(self.controller)
         return eqx.tree_at(lambda x: x.controller, self, fixed)
+
+
+class Timed(AbstractTrack):
+    """Values at given times, wherever these are in the steps."""
+
+    times: Float[Array, " rows"]
+    # Of the row, the number and the start of its step, and whether it is inside of it.
+    value: Callable[[Array, Array, Array, Point], PyTree]
+    init: PyTree
+
+    def start(self):
+        number = len(self.times)
+        found = jnp.full(number, MOST_STEPS), jnp.ones(number, bool)
+        return jnp.zeros((), int), found, stack(self.init, number)
+
+    def due(self, state):
+        j, *_ = state
+        t = self.times[jnp.minimum(j, len(self.times) - 1)]
+        # At once if that is a gap in measured times.
+        t = jnp.where(jnp.isnan(t), -jnp.inf, t)
+        left = j < len(self.times)
+        return Stop(jnp.asarray(MOST_STEPS), jnp.where(left, t, jnp.inf))
+
+    def visit(self, state, n, point):
+        j, (stops, insides), rows = state
+        inside = self.times[j] > point[1][1].t
+        found = stops.at[j].set(n), insides.at[j].set(inside)
+        return j + 1, found, put(rows, j, self.value(j, n, inside, point))
+
+    def rows(self, state):
+        return state[1:]
+
+
+class Kept(AbstractTrack):
+    """The states after every so many steps, as many as there is room for."""
+
+    most: int = eqx.field(static=True)
+    init: Point
+
+    def start(self):
+        zero, one = jnp.zeros((), int), jnp.ones((), int)
+        return zero, one, stack(self.init, self.most)
+
+    def due(self, state):
+        count, every, _ = state
+        return Stop(count * every)
+
+    def visit(self, state, n, point):
+        count, every, rows = state
+        full = count == self.most
+        half = (self.most + 1) // 2
+        # Every other one is dropped.
+        fewer = lambda x: jnp.concatenate([x[::2], x[half:]])[: self.most]
+        rows = lax.cond(full, lambda: jtu.tree_map(fewer, rows), lambda: rows)
+        count, every = jnp.where(full, half, count), jnp.where(full, 2 * every, every)
+        here = count * every == n  # Not if an odd number was full.
+        rows = put(rows, jnp.minimum(count, self.most - 1), point, here)
+        return jnp.where(here, count + 1, count), every, rows
+
+    def rows(self, state):
+        count, every, rows = state
+        i = jnp.arange(self.most)
+        return jnp.where(i < count, i * every, MOST_STEPS), rows
