@@ -227,6 +227,9 @@ def check_bare(run: Run, rounding: float):
         run.system, run.bare, run.t0, run.t1, dt0, run.y0, max_steps=256
     )
     difference = np.max(np.abs(flat(last(saved[-1][1])) - flat(last(sol.ys))))
+    friction = run.system.fit_friction(run.y0[1])
+    if steps > 1 and friction is not None and not friction.is_known:
+        rounding = 1e-3  # in a step of many stages its integrals are more accurate
     assert difference <= rounding, f"{difference:.1e} from the bare scheme"
 
 
