@@ -15,7 +15,6 @@ from .._compositions import lengths
 from .._forms import divide
 from .._friction._base import AbstractFriction, MASS, Mechanics
 from .._friction._damping import as_laws
-from .._friction._fit import fit_friction
 from .._friction._linear import LinearFriction
 from .._numbers import cast_to, Scalar, State, Time
 from ._base import AbstractSystem, P, Q
@@ -145,7 +144,7 @@ class ManifoldSystem(AbstractSystem):
         return self.pair(self._each("project", *y))
 
     def fit_friction(self, p: P) -> LinearFriction | None:
-        friction = fit_friction(self.parts.linear, self.mechanics, p)
+        friction = super().fit_friction(p)
         if friction is not None and not (self.is_free or friction.is_one_rate):
             raise ValueError(
                 "Friction on a `Sphere` or a `Stiefel` must be at one rate. Write "
