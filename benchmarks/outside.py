@@ -24,7 +24,7 @@ def heyoka_runs(problem, tolerances):
         integrator.time = 0.0
         integrator.state[:] = state
         integrator.propagate_until(problem.t1)
-        return integrator.state.reshape(2, n).copy(), 0
+        return integrator.state.reshape(2, n).copy(), 0, False
 
     return {"heyoka": (solve, list(tolerances))}
 
