@@ -71,7 +71,7 @@ SOFRONIOU_SPALETTA = {
 }
 
 
-def stages(weights: Sequence[float]) -> np.ndarray:
+def substeps(weights: Sequence[float]) -> np.ndarray:
     """Start, end and length of consecutive stages, in units of the whole."""
     ends = np.cumsum(weights)
     ends[-1] = 1

@@ -86,7 +86,7 @@ def contract(g, y: PyTree) -> PyTree:
         # x = x + g(x) - b
         def iterate(state):
             x, _, _, least, stalled, count = state
-            new = tree.sub(tree.sum(x, g(x)), b)
+            new = tree.sub(tree.add(x, g(x)), b)
             change = largest_change(new, x, least.dtype)
             stalled = jnp.where(change < least, 0, stalled + 1)
             return new, change, state[1], jnp.minimum(change, least), stalled, count + 1

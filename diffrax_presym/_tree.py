@@ -58,13 +58,13 @@ def from_sums(sums: PyTree, like: PyTree) -> PyTree:
     return jtu.tree_map(leaf, like, sums, is_leaf=is_sum)
 
 
-def add(y: PyTree, h: ArrayLike, dy: PyTree) -> PyTree:
+def add_scaled(y: PyTree, h: ArrayLike, dy: PyTree) -> PyTree:
     """`y + h * dy`, each leaf in its own precision. Leaves of `y` may be `Sum`s."""
     add = lambda di, yi: yi + cast_to(h, di) * di
     return jtu.tree_map(add, dy, y)
 
 
-def sum(x: PyTree, y: PyTree) -> PyTree:
+def add(x: PyTree, y: PyTree) -> PyTree:
     """`x + y`. Leaves of `x` may be `Sum`s."""
     return jtu.tree_map(lambda yi, xi: xi + yi, y, x)
 

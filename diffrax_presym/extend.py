@@ -14,8 +14,8 @@ from ._scheme._base import (
 )
 from ._scheme._engine import (
     AbstractMove as AbstractMove,
+    MoveSequence as MoveSequence,
     Span as Span,
-    Stages as Stages,
 )
 from ._scheme._moves import Drift as Drift, Kick as Kick
 from ._system._base import AbstractSystem as AbstractSystem

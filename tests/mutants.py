@@ -273,8 +273,8 @@ MUTANTS = [
     Mutant(
         "the cotangents of what a step holds are dropped",
         "_loop/_backward.py",
-        "gradient, ends = tree.sum(at.gradient, more)",
-        "gradient, ends = tree.sum(at.gradient, _zeros(more))",
+        "gradient, ends = tree.add(at.gradient, more)",
+        "gradient, ends = tree.add(at.gradient, _zeros(more))",
         ("reversal",),
     ),
     Mutant(

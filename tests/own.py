@@ -101,7 +101,7 @@ class _Leapfrog(extend.AbstractPresymplecticSolver):
     def _scheme(self, kick):
         drift = extend.Drift("any", 2)
         table = [(0, 0.5, 0.5), (0.5, 0.5, 1), (0.5, 1, 0.5)]
-        return extend.Scheme(extend.Stages([drift, kick, drift], table))
+        return extend.Scheme(extend.MoveSequence([drift, kick, drift], table))
 
 
 class DrivenLeapfrog(_Leapfrog):

@@ -197,7 +197,7 @@ DOCUMENTED_AS_A_WHOLE = {
     "extend.Parts",
     "extend.Scheme",
     "extend.Span",
-    "extend.Stages",
+    "extend.MoveSequence",
     "extend.System",
     "SplittingTableau",
 }

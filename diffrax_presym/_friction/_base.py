@@ -37,7 +37,7 @@ class Mechanics(NamedTuple):
     mass_varies: bool = False
 
 
-class Linear(NamedTuple):
+class LinearPart(NamedTuple):
     """Friction at a rate that depends on time alone, part of every drift."""
 
     log_scale: AbstractLogScale
@@ -61,7 +61,7 @@ class Parts(NamedTuple):
     - `forces`: any other law, part of the force.
     """
 
-    linear: tuple[Linear, ...] = ()
+    linear: tuple[LinearPart, ...] = ()
     local: tuple[Any, ...] = ()
     drags: tuple[Any, ...] = ()
     forces: tuple[Any, ...] = ()

@@ -12,11 +12,11 @@ from .. import _tree as tree
 from .._checks import as_finite, check_callable
 from .._forms import multiply
 from .._numbers import as_time, cast_to, Time
-from ._base import AbstractFriction, Linear as LinearPart, Mechanics, Parts
+from ._base import AbstractFriction, LinearPart, Mechanics, Parts
 from ._log_scale import (
     AbstractLogScale,
     FunctionOfTime,
-    Linear,
+    LinearScale,
     Logarithm,
     Power,
 )
@@ -49,7 +49,7 @@ class Damping(AbstractFriction):
             value = values(law)
             return jtu.tree_map(lambda x: cast_to(x, value) * value, factor)
 
-        return functools.reduce(tree.sum, [term(*x) for x in self.terms])
+        return functools.reduce(tree.add, [term(*x) for x in self.terms])
 
     def __call__(self, t: Time) -> Numbers:
         """The log scale `η(t)`."""
@@ -98,7 +98,7 @@ def ConstantDamping(gamma) -> Damping:
     `ValueError` if it is not a finite real number or array; and when the solve is
     traced, if it does not fit `p`.
     """
-    return Damping(((Linear(), as_numbers(gamma, "`ConstantDamping(gamma)`")),))
+    return Damping(((LinearScale(), as_numbers(gamma, "`ConstantDamping(gamma)`")),))
 
 
 def LogDamping(gamma, shift: ArrayLike | None = None) -> Damping:

@@ -15,7 +15,7 @@ from ._base import (
     COEFFICIENTS,
     DAMPING,
     Form,
-    Linear as LinearPart,
+    LinearPart,
     MASS,
     Mechanics,
     Parts,

@@ -96,7 +96,7 @@ def by_quadrature(terms: Terms, t: Time, h: Time, order: int) -> Effect:
     return Effect(expm1(-increment(terms, t, h)), *integrals)
 
 
-class Linear(AbstractLogScale):
+class LinearScale(AbstractLogScale):
     """`η(t) = t`."""
 
     is_autonomous: ClassVar[bool] = True

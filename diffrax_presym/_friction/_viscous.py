@@ -16,11 +16,11 @@ from ._base import (
     COEFFICIENTS,
     DAMPING,
     Form,
-    Linear,
+    LinearPart,
     Mechanics,
     Parts,
 )
-from ._log_scale import Linear as LinearScale
+from ._log_scale import LinearScale
 
 
 _FORMS = (
@@ -55,7 +55,7 @@ class ViscousFriction(AbstractFriction):
         if mechanics.mass_varies:
             return Parts(forces=(self,))
         needs_mass(mechanics, "ViscousDamping")
-        return Parts((Linear(LinearScale(), self.coefficients, per_velocity=True),))
+        return Parts((LinearPart(LinearScale(), self.coefficients, per_velocity=True),))
 
     def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
         return tree.scale(-1, multiply(self.coefficients, v, COEFFICIENTS, "v"))

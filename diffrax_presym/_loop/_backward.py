@@ -39,7 +39,7 @@ class BackwardState(eqx.Module):
 
     def add(self, gradient: PyTree, bar: PyTree) -> "BackwardState":
         where = lambda x: (x.gradient, x.bar)
-        new = tree.sum((self.gradient, self.bar), (gradient, bar))
+        new = tree.add((self.gradient, self.bar), (gradient, bar))
         return eqx.tree_at(where, self, new, is_leaf=lambda x: x is None)
 
 
@@ -154,7 +154,7 @@ class Backward(eqx.Module):
 
         end, pull = jax.vjp(redo, moved, point)
         more, bar = pull(at.bar)
-        gradient, ends = tree.sum(at.gradient, more), (at.point[0], end[0])
+        gradient, ends = tree.add(at.gradient, more), (at.point[0], end[0])
         return BackwardState(n, point, bar, gradient, at.tracks, ends)
 
     def row(self, i: int, row: Array, pred: Any) -> PyTree:
@@ -261,7 +261,7 @@ class PullNodes(AbstractPull):
             more, bar = backward.pull(output, bar, y)
             bars = self.stencils.spread(j, bar, bars)
             low = jnp.where(rows.stop[j] >= 0, self.stencils.first[j], low)
-            return tree.sum(gradient, more), low, j, bars
+            return tree.add(gradient, more), low, j, bars
 
         def unspread(x):
             last = self.stencils.last[x[2] - 1]

@@ -57,7 +57,7 @@ def run(problem: Problem, kept: AbstractTrack | None = None):
     for a gradient."""
     number, keep = len(problem.rows), kept is not None
     tracks = [_tracks(problem, i, keep) for i in range(number)]
-    progress, (stacked, kept_states) = _walk(problem, (tracks, kept))
+    progress, (stacked, kept_states) = _run_steps(problem, (tracks, kept))
 
     saved, between, finite = [], [], tree.all_finite(progress.point[0])
     all_rows = []
@@ -122,7 +122,7 @@ def _tracks(
     return at_steps, Interpolated(stencils, kinks, functions.node, value, y, init)
 
 
-def _walk(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
+def _run_steps(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
     """All steps, stopping where a value of a track is due."""
     steps, last, meter = problem.steps, problem.last, problem.progress_meter
     may_be_cut = not steps.are_known and tracks[1] is not None

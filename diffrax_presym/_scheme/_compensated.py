@@ -6,7 +6,7 @@ from .._numbers import State
 from .._system._base import AbstractSystem
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, check_base, Scheme
-from ._engine import inverse, Stages
+from ._engine import inverse, MoveSequence
 from ._moves import ToSums
 
 
@@ -82,7 +82,7 @@ class Compensated(AbstractPresymplecticSolver):
         inner = base.check
         check = inner and (lambda system, t, y, x: inner(system, t, y, x[0]))
         return base._replace(
-            moves=Stages(moves, [(0, 0, 0), (0, 1, 1), (1, 1, 0)]),
+            moves=MoveSequence(moves, [(0, 0, 0), (0, 1, 1), (1, 1, 0)]),
             start=start,
             end_force=lambda carry: base.end_force(carry[0]),
             check=check,

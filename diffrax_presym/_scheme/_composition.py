@@ -7,10 +7,10 @@ from decimal import Decimal, localcontext
 
 import equinox as eqx
 
-from .._compositions import SOFRONIOU_SPALETTA, stages, SUZUKI_4
+from .._compositions import SOFRONIOU_SPALETTA, substeps, SUZUKI_4
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, check_base, Scheme
-from ._engine import Stages
+from ._engine import MoveSequence
 from ._frozen import PresymplecticLeapfrog
 from ._strong_friction import friction_limit, part_of
 
@@ -83,7 +83,7 @@ class Composition(AbstractPresymplecticSolver):
         if most == math.inf:
             most = friction_limit(system, pattern, self.order(None))
         return scheme._replace(
-            moves=Stages([scheme.moves], stages(self.weights)),
+            moves=MoveSequence([scheme.moves], substeps(self.weights)),
             most_friction=most,
             pattern=pattern,
         )

@@ -2,7 +2,7 @@
 
 A move maps the state within a step over a span of time, in two phases: what depends on
 time alone is prepared, for all stages at once, and what touches the state is applied.
-`Stages` are sequences of moves. A step and its inverse traverse the same list.
+`MoveSequence` are sequences of moves. A step and its inverse traverse the same list.
 """
 
 import abc
@@ -28,8 +28,8 @@ from .._system._bound import System
 
 Result: TypeAlias = dfx.RESULTS | None  # `None`: no move could fail
 # The state within a step: positions and momenta, and the solver state.
-Stage: TypeAlias = PyTree
-Outcome: TypeAlias = tuple[Stage, Result]
+StepState: TypeAlias = PyTree
+Outcome: TypeAlias = tuple[StepState, Result]
 
 
 class Span(NamedTuple):
@@ -64,11 +64,15 @@ class AbstractMove(eqx.Module):
     """
 
     @abc.abstractmethod
-    def apply(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+    def apply(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         """The state at the end of the span, from that at its start."""
 
     @abc.abstractmethod
-    def undo(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+    def undo(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         """The inverse: the state at the end of the reversed span."""
 
     def prepare(self, system: System, span: Span) -> PyTree:
@@ -96,14 +100,18 @@ class Inverse(AbstractMove):
     def is_autonomous(self, system: System) -> bool:
         return self.move.is_autonomous(system)
 
-    def apply(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+    def apply(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         return self.move.undo(system, span, data, stage)
 
-    def undo(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+    def undo(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         return self.move.apply(system, span, data, stage)
 
 
-class Stages:
+class MoveSequence:
     """A sequence of moves, repeated for each row of a table.
 
     A row has three numbers for each move: its start, end and length, in units of the
@@ -119,25 +127,25 @@ class Stages:
         self.table = np.reshape(np.asarray(table, float), (-1, len(self.moves), 3))
 
     @property
-    def inverse(self) -> "Stages":
+    def inverse(self) -> "MoveSequence":
         """The adjoint sequence: the inverses in reverse order."""
         moves = [inverse(move) for move in self.moves[::-1]]
         start, end, length = np.moveaxis(self.table[::-1, ::-1], -1, 0)
-        return Stages(moves, np.stack([1 - end, 1 - start, length], axis=-1))
+        return MoveSequence(moves, np.stack([1 - end, 1 - start, length], axis=-1))
 
 
-Moves: TypeAlias = AbstractMove | Stages
+Moves: TypeAlias = AbstractMove | MoveSequence
 
 
 def inverse(moves: Moves) -> Moves:
-    if isinstance(moves, Stages):
+    if isinstance(moves, MoveSequence):
         return moves.inverse
     return moves.move if isinstance(moves, Inverse) else Inverse(moves)
 
 
 def is_autonomous(moves: Moves, system: System) -> bool:
     """Whether what the moves prepare depends on the length of a span alone."""
-    if not isinstance(moves, Stages):
+    if not isinstance(moves, MoveSequence):
         return moves.is_autonomous(system)
     return all(is_autonomous(move, system) for move in moves.moves)
 
@@ -161,14 +169,14 @@ def prepare(moves: Moves, system: System, span: Span, backward: bool = False) ->
 
 def _number(moves: Moves) -> int:
     """Of moves in a step."""
-    if not isinstance(moves, Stages):
+    if not isinstance(moves, MoveSequence):
         return 1
     return len(moves.table) * sum(map(_number, moves.moves))
 
 
 def _extent(moves: Moves) -> tuple[float, float]:
     """The first and the last time of any move, in units of the step."""
-    if not isinstance(moves, Stages):
+    if not isinstance(moves, MoveSequence):
         return 0.0, 1.0
     times = [0.0, 1.0]
     for i, move in enumerate(moves.moves):
@@ -178,7 +186,7 @@ def _extent(moves: Moves) -> tuple[float, float]:
 
 
 def _prepare(moves: Moves, system: System, span: Span, backward: bool) -> PyTree:
-    if not isinstance(moves, Stages):
+    if not isinstance(moves, MoveSequence):
         return moves.prepare(system, span.reversed if backward else span)
 
     def column(move: Moves, rows: np.ndarray) -> PyTree:
@@ -232,40 +240,40 @@ def _unless_amplified(system: System, span: Span, data: PyTree) -> PyTree:
 
 
 def forward(
-    moves: Moves, system: System, span: Span, data: PyTree, stage: Stage
+    moves: Moves, system: System, span: Span, data: PyTree, stage: StepState
 ) -> Outcome:
     """Apply all moves, in order, with what was prepared for them."""
     act = lambda move, *args: move.apply(system, *args)
-    return _walk(act, moves, span, data, stage)
+    return _traverse(act, moves, span, data, stage)
 
 
 def backward(
-    moves: Moves, system: System, span: Span, data: PyTree, stage: Stage
-) -> Stage:
+    moves: Moves, system: System, span: Span, data: PyTree, stage: StepState
+) -> StepState:
     """Invert all moves, in reverse order, with what was prepared for that."""
     act = lambda move, span, *args: move.undo(system, span.reversed, *args)
-    return _walk(act, moves, span, data, stage, reverse=True)[0]
+    return _traverse(act, moves, span, data, stage, reverse=True)[0]
 
 
-def _walk(
+def _traverse(
     act: Callable[..., Outcome],
     moves: Moves,
     span: Span,
     data: PyTree,
-    state: Stage,
+    state: StepState,
     reverse: bool = False,
 ) -> Outcome:
     """Apply `act` to each move, its part of the span and its data, in order."""
-    if not isinstance(moves, Stages):
+    if not isinstance(moves, MoveSequence):
         return act(moves, span, data, state)
     order = slice(None, None, -1 if reverse else 1)
     each = list(enumerate(moves.moves))[order]
 
-    def row(state: Stage, parts, data) -> Outcome:
+    def row(state: StepState, parts, data) -> Outcome:
         result = None
         for i, move in each:
             part = span.part(*parts[i])
-            state, more = _walk(act, move, part, data[i], state, reverse)
+            state, more = _traverse(act, move, part, data[i], state, reverse)
             result = first_failure(result, more)
         return state, result
 

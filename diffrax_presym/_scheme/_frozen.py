@@ -6,14 +6,14 @@ import equinox as eqx
 
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, Scheme
-from ._engine import inverse, Stages
+from ._engine import inverse, MoveSequence
 from ._find_split import find_split
 from ._moves import FrozenDrift, Kick
 from ._splitting import first_force
 from ._strong_friction import part_of, Pattern
 
 
-def _momentum_first(solver, system: System, known: bool = False) -> Stages:
+def _momentum_first(solver, system: System, known: bool = False) -> MoveSequence:
     """A kick at `t`, then a drift to `t + h` with the velocity frozen at `t`: equation
     (presymp_euler), here A. Its inverse is position first, a drift with the velocity
     frozen at `t + h`, then a kick there: equation (presymp_euler2), here B.
@@ -22,7 +22,7 @@ def _momentum_first(solver, system: System, known: bool = False) -> Stages:
     """
     find_split(solver, "separable", system)
     kick = Kick("separable", 1, known)
-    return Stages([kick, FrozenDrift()], [(0, 0, 1), (0, 1, 1)])
+    return MoveSequence([kick, FrozenDrift()], [(0, 0, 1), (0, 1, 1)])
 
 
 _EULER: Pattern = (("kick", 1.0, 0), ("move", 1.0, 0), ("decay", 1.0, 0))
@@ -147,7 +147,7 @@ class PresymplecticLeapfrog(AbstractPresymplecticSolver):
         if self.first == "momentum":
             # In both directions the first kick is by the force known from the last one.
             A = _momentum_first(self, system, known=True)
-            moves = Stages([A, inverse(A)], [(0, 0.5, 0.5), (0.5, 1, 0.5)])
+            moves = MoveSequence([A, inverse(A)], [(0, 0.5, 0.5), (0.5, 1, 0.5)])
             start = lambda system, t, y: first_force(system, "separable", t, y)
             return Scheme(
                 moves,
@@ -158,7 +158,7 @@ class PresymplecticLeapfrog(AbstractPresymplecticSolver):
         # Two kicks at the same position are merged.
         kick, drift = _momentum_first(self, system).moves
         table = [(0, 0.5, 0.5), (0.5, 0.5, 1), (0.5, 1, 0.5)]
-        moves = Stages([inverse(drift), kick, drift], table)
+        moves = MoveSequence([inverse(drift), kick, drift], table)
         return Scheme(moves, pattern=_HALF[::-1] + _HALF)
 
 

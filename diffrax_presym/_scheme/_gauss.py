@@ -18,7 +18,7 @@ from .._numbers import cast_to, State
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, refuse_constrained, Scheme
 from ._collocation import gauss_table, legendre, MAX_STAGES
-from ._engine import AbstractMove, Outcome, Span, Stage
+from ._engine import AbstractMove, Outcome, Span, StepState
 from ._gauss_solve import (
     by_root_finder,
     fixed_point,
@@ -72,7 +72,7 @@ class Collocation(AbstractMove):
         return system.prepares_once
 
     def apply(
-        self, system: System, span: Span, data: Frames | None, stage: Stage
+        self, system: System, span: Span, data: Frames | None, stage: StepState
     ) -> Outcome:
         y, carry = stage
         sums = tree.to_sums(y, carry.lost)
@@ -88,7 +88,7 @@ class Collocation(AbstractMove):
         return (tree.from_sums(sums, y), carry), result
 
     def undo(
-        self, system: System, span: Span, data: Frames | None, stage: Stage
+        self, system: System, span: Span, data: Frames | None, stage: StepState
     ) -> Outcome:
         return self.apply(system, span, data, stage)
 

@@ -27,7 +27,7 @@ from ._engine import Span
 # in the frame of its middle.
 Slopes = PyTree[Shaped[Array, "stages ..."]]
 # Positions and momenta of all stages, in that frame.
-Stages = PyTree[Shaped[Array, "stages ..."]]
+StageValues = PyTree[Shaped[Array, "stages ..."]]
 
 
 class Frames(NamedTuple):
@@ -99,7 +99,7 @@ class GaussStep(eqx.Module):
         self.slopes, self.velocities = convert(slope, *base), convert(velocity, *base)
         self.forces = convert(force, *base, base[0])
 
-    def stages(self, slopes: Slopes) -> Stages:
+    def stages(self, slopes: Slopes) -> StageValues:
         q, p = slopes
         return self._stages(0, q), self._stages(1, p)
 
@@ -114,7 +114,9 @@ class GaussStep(eqx.Module):
 
         return jtu.tree_map(leaf, self.base[i], self.base_lost[i], slopes)
 
-    def iterate(self, slopes: Slopes, stages: Stages) -> tuple[Slopes, Stages]:
+    def iterate(
+        self, slopes: Slopes, stages: StageValues
+    ) -> tuple[Slopes, StageValues]:
         """Better slopes and stages: momenta by the forces, then positions by the
         velocities at these, which halves the iterations."""
         q, p = stages
@@ -138,7 +140,7 @@ def matrix_product(matrix, x):
 class _Search(NamedTuple):
     """The state of a fixed-point iteration."""
 
-    stages: Stages
+    stages: StageValues
     slopes: Slopes
     # One array, as XLA would make a kernel for each number. Changes are those of the
     # stages, in units of their rounding.

@@ -9,17 +9,19 @@ from jaxtyping import PyTree
 
 from .. import _tree as tree
 from .._system._bound import System
-from ._engine import AbstractMove, Outcome, Span, Stage
+from ._engine import AbstractMove, Outcome, Span, StepState
 
 
 class Enter(AbstractMove):
     """From `(q, p)` to the variables of the shared split; the inverse goes back."""
 
-    def apply(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
+    def apply(
+        self, system: System, span: Span, data: None, stage: StepState
+    ) -> Outcome:
         y, carry = stage
         return (system.split("shared").enter(system, span.t0, y), carry), None
 
-    def undo(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
+    def undo(self, system: System, span: Span, data: None, stage: StepState) -> Outcome:
         y, carry = stage
         return (system.split("shared").leave(system, span.t0, y), carry), None
 
@@ -37,12 +39,16 @@ class Drift(AbstractMove):
     def is_autonomous(self, system: System) -> bool:
         return system.prepares_once
 
-    def apply(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+    def apply(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         (y, carry), split = stage, system.split(self.kind)
         y, result = split.attempt(system, span.t0, span.h, data, y)
         return (y, carry), result
 
-    def undo(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+    def undo(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         return self.apply(system, span, data, stage)
 
 
@@ -57,13 +63,15 @@ class Kick(AbstractMove):
     order: int = eqx.field(static=True)
     known: bool = eqx.field(static=True, default=False)
 
-    def apply(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
+    def apply(
+        self, system: System, span: Span, data: None, stage: StepState
+    ) -> Outcome:
         if not self.known:
             return self.undo(system, span, data, stage)
         (y, force), split = stage, system.split(self.kind)
         return (split.kick(system, span.t0, span.h, y, force, self.order), None), None
 
-    def undo(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
+    def undo(self, system: System, span: Span, data: None, stage: StepState) -> Outcome:
         (y, carry), split = stage, system.split(self.kind)
         force = split.force(system, span.t0, y)
         y = split.kick(system, span.t0, span.h, y, force, self.order)
@@ -92,13 +100,17 @@ class FrozenDrift(AbstractMove):
     def is_autonomous(self, system: System) -> bool:
         return system.prepares_once
 
-    def apply(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+    def apply(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         y, carry = stage
         velocity = system.velocity(span.t0, y)
         y = system.add(y, (tree.scale(span.h, velocity), None))
         return (system.decay(data, y), carry), None
 
-    def undo(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+    def undo(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         y, carry = stage
         y = system.decay(data, y)
         velocity = system.velocity(span.t1, y)
@@ -111,10 +123,12 @@ class ToSums(AbstractMove):
     The solver state is `(carry, rounding errors)` outside, and `carry` within.
     """
 
-    def apply(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
+    def apply(
+        self, system: System, span: Span, data: None, stage: StepState
+    ) -> Outcome:
         y, (carry, lost) = stage
         return (tree.to_sums(y, lost), carry), None
 
-    def undo(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
+    def undo(self, system: System, span: Span, data: None, stage: StepState) -> Outcome:
         y, carry = stage
         return (system.values(y), (carry, tree.rounding_errors(y))), None

@@ -19,7 +19,7 @@ from .._numbers import cast_to, State
 from .._results import MULTISTEP_UNSTABLE, OTHER_HISTORY
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, Scheme
-from ._engine import AbstractMove, forward, Outcome, prepare, Span, Stage
+from ._engine import AbstractMove, forward, Outcome, prepare, Span, StepState
 from ._find_split import find_split
 from ._splitting import BlanesCasasRKN8
 
@@ -97,11 +97,13 @@ class Multistep(AbstractMove):
     def is_autonomous(self, system: System) -> bool:
         return system.prepares_once
 
-    def apply(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+    def apply(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         (y, old), (t0, t1, h), table = stage, span, _TABLES[self.order]
         (decay, data), split = data, system.split("shared")
         # From the frame of the start of the step to that of its end.
-        move = lambda x: x if decay is None else tree.add(x, decay, x)
+        move = lambda x: x if decay is None else tree.add_scaled(x, decay, x)
         steps, length = _steps(span, old)
         is_short = steps < self.order - 1
 
@@ -136,7 +138,9 @@ class Multistep(AbstractMove):
         new = _Carry(steps + 1, length, momentum, force, filter)
         return ((q, p), new), None
 
-    def undo(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+    def undo(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         raise NotImplementedError  # The history before a change of length is lost.
 
     def _momentum(
@@ -145,7 +149,7 @@ class Multistep(AbstractMove):
         """The momentum at the end of a step, from its mean over the step."""
         coefficients = _TABLES[self.order].momentum
         weigh = lambda s, f: sum(map(operator.mul, coefficients, (*s, f)))
-        end = tree.add(tree.values(mean), h, jtu.tree_map(weigh, *history))
+        end = tree.add_scaled(tree.values(mean), h, jtu.tree_map(weigh, *history))
         return system.split("shared").leave(system, t, (tree.values(q), end))[1]
 
     def check(self, system: System, t: Array, y: State, carry: _Carry) -> dfx.RESULTS:

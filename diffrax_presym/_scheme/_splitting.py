@@ -6,11 +6,11 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._compositions import stages
+from .._compositions import substeps
 from .._numbers import State
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, Scheme
-from ._engine import inverse, Moves, Stages
+from ._engine import inverse, Moves, MoveSequence
 from ._find_split import find_split
 from ._moves import Drift, Enter, Kick
 from ._strong_friction import friction_limit
@@ -50,7 +50,7 @@ class AbstractSplitting(AbstractPresymplecticSolver):
         split, tableau = find_split(self, self.tableau.kind, system), self.tableau
         kind, order, first = tableau.kind, tableau.order, tableau.kick_first
         drift, kick = Drift(kind, order), Kick(kind, order)
-        drifts = stages(tableau.fractions[first::2])
+        drifts = substeps(tableau.fractions[first::2])
         kicks = tableau.fractions[not first :: 2]
         names, by = split.names, split.quadrature(system, order)
         parts = zip(itertools.cycle(names[:: 1 if first else -1]), tableau.fractions)
@@ -61,7 +61,7 @@ class AbstractSplitting(AbstractPresymplecticSolver):
         if len(drifts) > 1:
             ends, inner = drifts[:-1, 1], kicks[first : first + len(drifts) - 1]
             table = drifts[:-1], np.stack([ends, ends, inner], axis=-1)
-            moves.insert(0, Stages([drift, kick], np.stack(table, axis=1)))
+            moves.insert(0, MoveSequence([drift, kick], np.stack(table, axis=1)))
             spans.insert(0, (0, 1, 1))
         if first:
             # The force of the last kick is that of the first kick of the next step.
@@ -73,7 +73,7 @@ class AbstractSplitting(AbstractPresymplecticSolver):
             moves = [enter, *moves, inverse(enter)]
             spans = [(0, 0, 0), *spans, (1, 1, 0)]
         scheme = Scheme(
-            Stages(moves, spans),
+            MoveSequence(moves, spans),
             # Interpolated values would be off the manifold.
             is_resolved=kind != "linear" and not system.term.is_constrained,
             most_friction=most,

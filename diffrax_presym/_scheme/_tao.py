@@ -14,7 +14,7 @@ from .._checks import as_positive
 from .._numbers import cast_to, State
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, refuse_constrained, Scheme
-from ._engine import AbstractMove, Outcome, Span, Stage, Stages
+from ._engine import AbstractMove, MoveSequence, Outcome, Span, StepState
 
 
 # Over a step: the momentum of the slow motion of an overdamped oscillator is then twice
@@ -29,19 +29,23 @@ class Exchange(AbstractMove):
     second: bool = eqx.field(static=True, default=False)
     known: bool = eqx.field(static=True, default=False)
 
-    def apply(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
+    def apply(
+        self, system: System, span: Span, data: None, stage: StepState
+    ) -> Outcome:
         if not self.known:
             # The map does not change the arguments of its field: it is its own inverse.
             return self.undo(system, span, data, stage)
         return self._by(stage[1][1], system, span, stage), None
 
-    def undo(self, system: System, span: Span, data: None, stage: Stage) -> Outcome:
+    def undo(self, system: System, span: Span, data: None, stage: StepState) -> Outcome:
         y, (copy, _) = stage
         one, other = (copy, y) if self.second else (y, copy)
         field = system.velocity_and_force(span.t0, (one[0], other[1]))
         return self._by(field, system, span, stage), None
 
-    def _by(self, field: State, system: System, span: Span, stage: Stage) -> Stage:
+    def _by(
+        self, field: State, system: System, span: Span, stage: StepState
+    ) -> StepState:
         y, (copy, carried) = stage
         velocity, force = tree.scale(span.h, field)
         if self.second:
@@ -60,11 +64,15 @@ class MoveFrames(AbstractMove):
     def is_autonomous(self, system: System) -> bool:
         return system.prepares_once
 
-    def apply(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+    def apply(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         y, (copy, field) = stage
         return (system.decay(data, y), (system.decay(data, copy), field)), None
 
-    def undo(self, system: System, span: Span, data: PyTree, stage: Stage) -> Outcome:
+    def undo(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         return self.apply(system, span, data, stage)
 
 
@@ -82,14 +90,18 @@ class Coupling(AbstractMove):
     def is_autonomous(self, system: System) -> bool:
         return True
 
-    def apply(self, system: System, span: Span, data: Array, stage: Stage) -> Outcome:
+    def apply(
+        self, system: System, span: Span, data: Array, stage: StepState
+    ) -> Outcome:
         y, (copy, field) = stage
         half = tree.scale(0.5, tree.sub(y, copy))
-        change = tree.add(rotate(data, half), -1, half)
+        change = tree.add_scaled(rotate(data, half), -1, half)
         copy = system.add(copy, tree.scale(-1, change))
         return (system.add(y, change), (copy, field)), None
 
-    def undo(self, system: System, span: Span, data: Array, stage: Stage) -> Outcome:
+    def undo(
+        self, system: System, span: Span, data: Array, stage: StepState
+    ) -> Outcome:
         return self.apply(system, span, data, stage)
 
 
@@ -101,8 +113,8 @@ def rotate(angle: Array, y: State) -> State:
     """
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     q, p = y
-    q1 = tree.add(tree.scale(cos, q), sin, p)
-    return q1, tree.add(tree.scale(cos, p), -sin, q)
+    q1 = tree.add_scaled(tree.scale(cos, q), sin, p)
+    return q1, tree.add_scaled(tree.scale(cos, p), -sin, q)
 
 
 class PresymplecticTao(AbstractPresymplecticSolver):
@@ -198,7 +210,7 @@ class PresymplecticTao(AbstractPresymplecticSolver):
                 "`PresymplecticTao(coupling)` with a few times the highest frequency "
                 "of the system, or `PresymplecticGauss(stages)`, which needs none."
             )
-        moves = Stages(moves, table)
+        moves = MoveSequence(moves, table)
         return Scheme(
             moves,
             start=start,

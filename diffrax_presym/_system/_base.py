@@ -78,7 +78,7 @@ class AbstractSystem(dfx.AbstractTerm):
         """The state `y` displaced by `dy`, of which either part may be `None`: a sum,
         or a step on a manifold. Solvers update states by it alone."""
         return tuple(  # pyright: ignore[reportReturnType]
-            x if dx is None else tree.sum(x, dx) for x, dx in zip(y, dy, strict=True)
+            x if dx is None else tree.add(x, dx) for x, dx in zip(y, dy, strict=True)
         )
 
     def check_state(self, y: PyTree) -> None:
@@ -161,11 +161,11 @@ class AbstractSystem(dfx.AbstractTerm):
         not part of drifts, and a user's force `external(t, q, v, args)`."""
         for law in self.laws:
             if not law.parts(self.mechanics).linear:
-                force = tree.sum(force, law.force(t, q, p, v, args))
+                force = tree.add(force, law.force(t, q, p, v, args))
         if external is None:
             return force
         value = external(t, q, v, args)
-        return tree.sum(force, match(value, q, "`force`", "`q`"))
+        return tree.add(force, match(value, q, "`force`", "`q`"))
 
     def fit_friction(self, p: P) -> LinearFriction | None:
         """The linear friction that depends on time alone, for momenta like `p`."""

@@ -104,9 +104,9 @@ class BregmanHamiltonian(AbstractSystem):
 
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         h, step = self.mirror_map, self.mirror_map.step(q, p)
-        end = tree.sum(q, step)
+        end = tree.add(q, step)
         # D_h*(grad h(q) + p, grad h(q)) is D_h(q, m).
-        divergence = h(q) - h(end) + tree.dot(tree.sum(h.gradient(q), p), step)
+        divergence = h(q) - h(end) + tree.dot(tree.add(h.gradient(q), p), step)
         objective = scalar_fn(self.objective, "The objective")(t, q, args)
         kinetic = tree.scale(self.scaling.rate(t), divergence)
         potential = tree.scale(self.scaling.strength(t), objective)
@@ -124,7 +124,7 @@ class BregmanHamiltonian(AbstractSystem):
         # The kinetic part depends on q too: its force is p - hess h(q) (m - q).
         _, change = jax.jvp(self.mirror_map.gradient, (q,), (step,))
         kinetic = self.mirror_map.project(tree.sub(p, change))
-        return tree.add(force, self.scaling.rate(t), kinetic)
+        return tree.add_scaled(force, self.scaling.rate(t), kinetic)
 
     def potential_force(self, t: Time, q: Q, args: PyTree = None) -> P:
         """The force of the objective."""

@@ -201,7 +201,7 @@ class ConstrainedSystem(AbstractSystem):
             (jnp.ones_like(t), v, net),
         )
         _, gained = jax.jvp(rate, (t, q, p), along)
-        return v, tree.sum(force, self._reaction(t, q, gained, args))
+        return v, tree.add(force, self._reaction(t, q, gained, args))
 
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         return self.velocity_and_force(t, q, p, args)[1]
@@ -239,7 +239,7 @@ class ConstrainedSystem(AbstractSystem):
         q = eqx.error_if(moved(x), ~regular, _REDUNDANT)
         q = eqx.error_if(q, ~found, _TOO_FAR)
         q, p = self.system.project(t, (q, p), args)
-        return q, tree.sum(p, self.to_tangent(t, q, p, args))
+        return q, tree.add(p, self.to_tangent(t, q, p, args))
 
 
 _REDUNDANT = (

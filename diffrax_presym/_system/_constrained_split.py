@@ -90,7 +90,7 @@ class ConstrainedSplit(AbstractSplit):
         if not self._is_plain:
             return force
         change = system.term.to_tangent(t, q, force, system.args, flow=0.0)
-        return tree.sum(force, change)
+        return tree.add(force, change)
 
     @property
     def _is_plain(self) -> bool:

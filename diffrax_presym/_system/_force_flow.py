@@ -27,7 +27,7 @@ class _Equation(eqx.Module):
     end: _Force
 
     def residual(self, change: PyTree) -> PyTree:
-        new = tree.sum(self.start, self.end(tree.sum(self.p, change)))
+        new = tree.add(self.start, self.end(tree.add(self.p, change)))
         return tree.sub(new, change)
 
 
@@ -45,7 +45,7 @@ def force_flow(
     taylor = [h**j / math.factorial(j) for j in range(1, k + 1)]
     pade = [math.comb(k, j) / math.comb(2 * k, j) * x for j, x in enumerate(taylor, 1)]
     at_end = [(-1) ** j * x for j, x in enumerate(pade)]
-    series = lambda weights, x: functools.reduce(tree.sum, map(tree.scale, weights, x))
+    series = lambda weights, x: functools.reduce(tree.add, map(tree.scale, weights, x))
     end = lambda p: series(at_end, _derivatives(force, p, k))
     # Traced once, with all that it depends on, to be differentiated.
     end, known = eqx.filter_closure_convert(end, p), _derivatives(force, p, k)
@@ -75,11 +75,11 @@ _MOST = 128  # iterations
 def _iterate(equation: _Equation, guess: PyTree) -> tuple[PyTree, Bool[Array, ""]]:
     """Fixed-point iteration to rounding: kicks are so short that it takes a few."""
     first = jnp.full_like(tree.largest(guess), _ROUNDING)
-    end = lambda change: tree.sum(equation.p, change)
+    end = lambda change: tree.add(equation.p, change)
 
     def iterate(state):
         found, moved, _, count = state
-        new = tree.sum(found, equation.residual(found))
+        new = tree.add(found, equation.residual(found))
         change = largest_change(end(new), end(found), first.dtype)
         return new, change, moved, count + 1
 

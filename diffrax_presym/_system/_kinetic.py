@@ -71,9 +71,9 @@ class AbstractKinetic(eqx.Module):
 
         def add(total, row):
             s, weight, data = row
-            left = p if friction is None else tree.sum(p, friction.decay(data, p))
+            left = p if friction is None else tree.add(p, friction.decay(data, p))
             part = tree.scale(weight, self.velocity(t + s, left, args))
-            return tree.sum(total, part), None
+            return tree.add(total, part), None
 
         rows = nodes, weights, each
         total, _ = lax.scan(add, tree.zeros(p), rows, unroll=True)

@@ -174,7 +174,7 @@ class ManifoldSystem(AbstractSystem):
             return jax.jvp(lambda s: m.flow(q, p, s), (zero,), (one,))[1]
 
         velocity, force = self.pair(self.map(free, q, p))
-        return velocity, tree.sum(force, self.kick(t, q, p, args))
+        return velocity, tree.add(force, self.kick(t, q, p, args))
 
     def to_momentum(self, q: Q, force: Q) -> P:
         """The rate of change of the momenta by a force in ambient coordinates."""
@@ -220,14 +220,14 @@ class ManifoldSplit(AbstractSplit):
         term, friction = system.term, system.friction
         if friction is None or not _only_shortens(system):
             if friction is not None:
-                p = tree.sum(p, friction.decay(data[0], p))
+                p = tree.add(p, friction.decay(data[0], p))
             flow = lambda m, q, p: m.flow(q, p, cast_to(h, p))
             q, p = term.pair(term.map(flow, q, p))
-            return q, p if friction is None else tree.sum(p, friction.decay(data[1], p))
+            return q, p if friction is None else tree.add(p, friction.decay(data[1], p))
         # Friction at a rate: a shorter time, and a slower motion.
         flow = lambda m, q, p, effect: m.flow(q, p, cast_to(effect.carried, p))
         q, p = term.pair(term.map(flow, q, p, data.leaves))
-        return q, tree.sum(p, friction.decay(data, p))
+        return q, tree.add(p, friction.decay(data, p))
 
     def force(self, system, t, y) -> PyTree:
         return system.term.kick(t, *tree.values(y), system.args)

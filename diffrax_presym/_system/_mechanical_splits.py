@@ -10,10 +10,10 @@ from jaxtyping import PyTree
 
 from .. import _tree as tree
 from .._compositions import lengths
-from .._friction._base import Linear
+from .._friction._base import LinearPart
 from .._friction._drag import Drag
 from .._friction._fit import fit_friction
-from .._friction._log_scale import Linear as LinearScale
+from .._friction._log_scale import LinearScale
 from .._numbers import as_time, State, Time
 from .._results import FORCE_NOT_SOLVED, NONFINITE
 from ._force_flow import force_flow
@@ -78,22 +78,22 @@ class KineticSplit(AbstractSplit):
         parts, mechanics = system.parts, system.term.mechanics
         pairs = zip(parts.local, forms, strict=True)
         linear = [
-            Linear(LinearScale(), x, part.per_velocity, may_couple=True)
+            LinearPart(LinearScale(), x, part.per_velocity, may_couple=True)
             for part, x in pairs
         ]
         friction = fit_friction(linear, mechanics, p)
 
         def pushed(dp: PyTree, h: Time) -> PyTree:
             if friction is None:
-                return tree.add(dp, h, force)
+                return tree.add_scaled(dp, h, force)
             bad = (as_time(h) < 0) & (friction.over(t, h) > _MOST_BACK)
             data = tree.invalid_if(bad, friction.prepare(t, h, order))
-            gained = friction.decay(data, tree.sum(p, dp))
-            return tree.sum(dp, tree.sum(gained, friction.respond(data, force)))
+            gained = friction.decay(data, tree.add(p, dp))
+            return tree.add(dp, tree.add(gained, friction.respond(data, force)))
 
         def slowed(drags: list[Drag], dp: PyTree, h: Time) -> PyTree:
             for drag in drags:
-                dp = tree.sum(dp, drag.decay(h, tree.sum(p, dp), mechanics.mass))
+                dp = tree.add(dp, drag.decay(h, tree.add(p, dp), mechanics.mass))
             return dp
 
         def stage(dp: PyTree, h: Time) -> tuple[PyTree, None]:
@@ -176,4 +176,4 @@ class SharedSplit(AbstractSplit):
         if law is None:
             return force
         mass = system.term.kinetic.momentum(tree.values(y[0]))
-        return tree.add(force, law.rate(t) ** 2 / 4, mass)
+        return tree.add_scaled(force, law.rate(t) ** 2 / 4, mass)

@@ -46,12 +46,12 @@ class AbstractMirrorMap(eqx.Module):
     def step(self, q: PyTree, p: PyTree) -> PyTree:
         """The mirror step `∇h^*(∇h(q) + p) - q`; not finite where undefined."""
         image = self.gradient(q)
-        end, start = self.inverse(tree.sum(image, p)), self.inverse(image)
+        end, start = self.inverse(tree.add(image, p)), self.inverse(image)
         return tree.sub(end, start)
 
     def change(self, q: PyTree, dq: PyTree) -> PyTree:
         """The difference `∇h(q + dq) - ∇h(q)`."""
-        return tree.sub(self.gradient(tree.sum(q, dq)), self.gradient(q))
+        return tree.sub(self.gradient(tree.add(q, dq)), self.gradient(q))
 
     def project(self, p: PyTree) -> PyTree:
         """`p` without the component that has no effect, if there is one."""

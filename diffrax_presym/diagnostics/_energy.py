@@ -108,7 +108,7 @@ def _power(system: AbstractSystem, t, y: State, args: PyTree):
     energy = lambda t, q, p: system.energy(t, q, p, args)
     explicit, slope, _ = jax.grad(energy, argnums=(0, 1, 2))(t, *y)
     velocity, force = system.vf(t, y, args)
-    done = tree.dot(velocity, tree.sum(force, slope))
+    done = tree.dot(velocity, tree.add(force, slope))
     return cast_to(explicit, done) + done
 
 
