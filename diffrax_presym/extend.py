@@ -5,7 +5,7 @@ from ._friction._base import (
     Mechanics as Mechanics,
     Parts as Parts,
 )
-from ._friction._damping import Damping as Damping
+from ._friction._damping import AbstractDamping as AbstractDamping
 from ._friction._log_scale import AbstractLogScale as AbstractLogScale
 from ._interpolation import HermiteInterpolation as HermiteInterpolation
 from ._scheme._base import (

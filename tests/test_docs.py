@@ -191,7 +191,7 @@ DOCUMENTED_AS_A_WHOLE = {
     "ChosenStep",
     "diagnostics.WorkPrecision",
     "diagnostics.WorkPrecisionRun",
-    "extend.Damping",
+    "extend.AbstractDamping",
     "extend.HermiteInterpolation",
     "extend.Mechanics",
     "extend.Parts",

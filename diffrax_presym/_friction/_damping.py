@@ -4,6 +4,7 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Inexact, PyTree
@@ -26,17 +27,17 @@ from ._log_scale import (
 Numbers = PyTree[Inexact[Array, "..."]]
 
 
-class Damping(AbstractFriction):
+class AbstractDamping(AbstractFriction):
     """Friction `p' = F - η'(t) p` at a rate, in units of one over time.
 
-    Made by `ConstantDamping`, `LogDamping` and `PowerDamping`. Positive rates damp,
-    negative rates excite. The log scale `η` is a sum of functions of time, each with a
-    factor: one number for friction alike on all momenta; or an array with as many
-    dimensions as `p` that broadcasts to it, or a pytree of these, with a rate for each
-    degree of freedom.
+    Positive rates damp, negative rates excite. The log scale `η` is a sum of functions
+    of time, each with a factor: one number for friction alike on all momenta; or an
+    array with as many dimensions as `p` that broadcasts to it, or a pytree of these,
+    with a rate for each degree of freedom.
     """
 
-    terms: tuple[tuple[AbstractLogScale, Any], ...]
+    # The functions of time, and their factors.
+    terms: eqx.AbstractVar[tuple[tuple[AbstractLogScale, Any], ...]]
 
     def parts(self, mechanics: Mechanics) -> Parts:
         return Parts(tuple(LinearPart(*term) for term in self.terms))
@@ -79,29 +80,37 @@ def as_numbers(x, name: str) -> Numbers:
     return jtu.tree_map(leaf, x) if jtu.tree_leaves(x) else leaf(x)
 
 
-def ConstantDamping(gamma) -> Damping:
+class ConstantDamping(AbstractDamping):
     """Friction `-γ p` at a constant rate `γ`, in units of one over time.
 
     The log scale is `η(t) = γ t`: the heavy-ball method and the damped oscillator,
     equation (eta1_large) of França, Jordan and Vidal (2021). For friction by a
     coefficient, in units of force per velocity, write `ViscousDamping`.
-
-    **Arguments:**
-
-    - `gamma`: the rate of damping, in units of one over time. Real, of any sign;
-        negative excites. A number, or for `MechanicalSystem` a rate for each degree of
-        freedom: an array with as many dimensions as `p` that broadcasts to it, or a
-        pytree of these.
-
-    **Raises:**
-
-    `ValueError` if it is not a finite real number or array; and when the solve is
-    traced, if it does not fit `p`.
     """
-    return Damping(((LinearScale(), as_numbers(gamma, "`ConstantDamping(gamma)`")),))
+
+    gamma: Numbers
+
+    def __init__(self, gamma):
+        """**Arguments:**
+
+        - `gamma`: the rate of damping, in units of one over time. Real, of any sign;
+            negative excites. A number, or for `MechanicalSystem` a rate for each degree
+            of freedom: an array with as many dimensions as `p` that broadcasts to it,
+            or a pytree of these.
+
+        **Raises:**
+
+        `ValueError` if it is not a finite real number or array; and when the solve is
+        traced, if it does not fit `p`.
+        """
+        self.gamma = as_numbers(gamma, "`ConstantDamping(gamma)`")
+
+    @property
+    def terms(self):
+        return ((LinearScale(), self.gamma),)
 
 
-def LogDamping(gamma, shift: ArrayLike | None = None) -> Damping:
+class LogDamping(AbstractDamping):
     """Friction that decays with time, `-γ p / (t + s)`.
 
     The log scale is `η(t) = γ log(t + s)`. With `γ = 3` and no shift this is the ODE of
@@ -113,20 +122,32 @@ def LogDamping(gamma, shift: ArrayLike | None = None) -> Damping:
     order `γ + 1`, and other schemes order 2. Schemes whose stages extend beyond the
     step, such as `SuzukiYoshida`, must start far enough from there; otherwise the solve
     fails.
-
-    **Arguments:**
-
-    - `gamma`: the strength of the damping, dimensionless, of any sign. A number, array
-        or pytree as for `ConstantDamping`.
-    - `shift`: the shift `s` of time, in units of time: a number. Defaults to none.
     """
-    if shift is not None:
-        shift = as_finite(shift, "`LogDamping(shift=...)`")
-    gamma = as_numbers(gamma, "`LogDamping(gamma)`")
-    return Damping(((Logarithm(shift), gamma),))
+
+    gamma: Numbers
+    shift: Inexact[Array, "..."] | None
+
+    def __init__(self, gamma, shift: ArrayLike | None = None):
+        """**Arguments:**
+
+        - `gamma`: the strength of the damping, dimensionless, of any sign. A number,
+            array or pytree as for `ConstantDamping`.
+        - `shift`: the shift `s` of time, in units of time: a number. Defaults to none.
+
+        **Raises:**
+
+        `ValueError` as `ConstantDamping`.
+        """
+        if shift is not None:
+            shift = as_finite(shift, "`LogDamping(shift=...)`")
+        self.gamma, self.shift = as_numbers(gamma, "`LogDamping(gamma)`"), shift
+
+    @property
+    def terms(self):
+        return ((Logarithm(self.shift), self.gamma),)
 
 
-def PowerDamping(gamma, delta) -> Damping:
+class PowerDamping(AbstractDamping):
     """Friction that varies like a power of time, `-γ δ t^(δ - 1) p`.
 
     The log scale is `η(t) = γ t^δ`. With an exponent between 0 and 1, and together with
@@ -135,16 +156,37 @@ def PowerDamping(gamma, delta) -> Damping:
     PowerDamping(gamma2, delta)]`. Time must not be negative; from `t = 0`, where the
     rate is infinite for an exponent below 1, a solve may start from zero momentum, with
     order 2.
-
-    **Arguments:**
-
-    - `gamma`: the strength, in units of time to the power `-δ`. A number, array or
-        pytree as for `ConstantDamping`.
-    - `delta`: the exponent, a number.
     """
-    delta = as_finite(delta, "`PowerDamping(..., delta)`")
-    gamma = as_numbers(gamma, "`PowerDamping(gamma, ...)`")
-    return Damping(((Power(delta), gamma),))
+
+    gamma: Numbers
+    delta: Inexact[Array, "..."]
+
+    def __init__(self, gamma, delta):
+        """**Arguments:**
+
+        - `gamma`: the strength, in units of time to the power `-δ`. A number, array or
+            pytree as for `ConstantDamping`.
+        - `delta`: the exponent, a number.
+
+        **Raises:**
+
+        `ValueError` as `ConstantDamping`.
+        """
+        self.delta = as_finite(delta, "`PowerDamping(..., delta)`")
+        self.gamma = as_numbers(gamma, "`PowerDamping(gamma, ...)`")
+
+    @property
+    def terms(self):
+        return ((Power(self.delta), self.gamma),)
+
+
+class SumOfDampings(AbstractDamping):
+    """Friction at a rate that is a sum, or a function of time of one's own."""
+
+    terms: tuple[tuple[AbstractLogScale, Any], ...]
+
+
+SumOfDampings.__init__.__doc__ = "**Arguments:** its fields, if any."
 
 
 _FRICTION = "`friction`"
@@ -162,7 +204,7 @@ def as_friction(law, name: str = _FRICTION) -> AbstractFriction:
         instead = _OF_PLACE if name == _FRICTION else ""
         check_callable(law, name.strip("`"), "eta(t)", instead=instead)
         law = law if isinstance(law, AbstractLogScale) else FunctionOfTime(law)
-        return Damping(((law, jnp.ones(())),))
+        return SumOfDampings(((law, jnp.ones(())),))
     raise ValueError(
         f"{name} must be a law of friction, a function eta(t) or a list of these, but "
         f"got {law!r}. For a constant rate write `ConstantDamping(rate)`, for a "

@@ -20,7 +20,7 @@ from ._base import (
     Mechanics,
     Parts,
 )
-from ._damping import Damping
+from ._damping import AbstractDamping, SumOfDampings
 from ._leaf import EntryFriction, MatrixFriction
 from ._linear import LinearFriction
 from ._log_scale import AbstractLogScale
@@ -143,7 +143,7 @@ def _as_matrix(rate: Array, like: Array) -> Array:
     return entries[..., None] * jnp.expand_dims(one, range(entries.ndim - 1))
 
 
-def one_rate(parts: Parts) -> Damping | None:
+def one_rate(parts: Parts) -> AbstractDamping | None:
     """The law of friction, if that is one rate for all momenta and nothing else.
 
     `ValueError` if there is any other friction.
@@ -155,7 +155,7 @@ def one_rate(parts: Parts) -> Damping | None:
             "`ConstantDamping(rate)` with a number; or use `energy(t, q, p)`."
         )
     terms = tuple((part.log_scale, part.form) for part in parts.linear)
-    return Damping(terms) if terms else None
+    return SumOfDampings(terms) if terms else None
 
 
 def has_one_rate(parts: Parts) -> bool:

@@ -1,8 +1,8 @@
 """Friction by coefficients, the force per velocity, and friction by place."""
 
 from collections.abc import Callable
+from typing import ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import PyTree
@@ -46,44 +46,10 @@ def arrays(form: PyTree, name: str) -> PyTree:
     return jtu.tree_map(jnp.asarray, form)
 
 
-class ViscousFriction(AbstractFriction):
-    """Linear friction by constant coefficients, part of every drift."""
-
-    coefficients: Form
-
-    def parts(self, mechanics: Mechanics) -> Parts:
-        if mechanics.mass_varies:
-            return Parts(forces=(self,))
-        needs_mass(mechanics, "ViscousDamping")
-        return Parts((LinearPart(LinearScale(), self.coefficients, per_velocity=True),))
-
-    def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
-        return tree.scale(-1, multiply(self.coefficients, v, COEFFICIENTS, "v"))
+_FUNCTION = "The function of friction"
 
 
-class LocalFriction(AbstractFriction):
-    """Linear friction by a function of time and place, part of every kick."""
-
-    form: Callable  # of t, q, args
-    per_velocity: bool = eqx.field(static=True)  # a coefficient, rather than a rate
-
-    def parts(self, mechanics: Mechanics) -> Parts:
-        if self.per_velocity and mechanics.mass_varies:
-            return Parts(forces=(self,))
-        if self.per_velocity:
-            needs_mass(mechanics, "ViscousDamping")
-        return Parts(local=(self,))
-
-    def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
-        x, name = (v, COEFFICIENTS) if self.per_velocity else (p, DAMPING)
-        return tree.scale(-1, multiply(self.at(t, q, args), x, name, "p"))
-
-    def at(self, t: Time, q: PyTree, args: PyTree) -> PyTree:
-        """The coefficients or rates at a time and a place."""
-        return arrays(self.form(t, q, args), "The function of friction")
-
-
-def ViscousDamping(coefficients) -> ViscousFriction | LocalFriction:
+class ViscousDamping(AbstractFriction):
     """Friction `-C v` by a coefficient `C`, in units of force per velocity: dashpots,
     viscous drag, magnetic fields, Coriolis forces.
 
@@ -119,40 +85,70 @@ def ViscousDamping(coefficients) -> ViscousFriction | LocalFriction:
         m, Omega = 2.0, jnp.array([0.0, 0.2, 0.3])
         coriolis = ViscousDamping(2 * m * cross_matrix(Omega))
         ```
-
-    **Arguments:**
-
-    - `coefficients`: `C`, in units of force per velocity (torque per angular velocity
-        for an angle), of any sign, in any of these forms.
-        - A number: the same for every degree of freedom.
-        - An array with as many dimensions as `p`, and broadcastable to it: a
-            coefficient for each degree of freedom.
-        - A square matrix, with `p` a vector; not necessarily symmetric.
-        - An array with one dimension more than `p`: a matrix for each vector over
-            the last axis of `p`. For the same matrix of `n` particles in three
-            dimensions, with `p` of shape `(n, 3)`, pass shape `(1, 3, 3)`.
-        - A pytree of the structure of `p`, whose leaves are any of the above.
-        - A `lineax.AbstractLinearOperator`, with `p` a vector. It is used as its
-            matrix.
-        - A function `C(t, q, args)` that returns any of the above but operators.
-
-    **Raises:**
-
-    `ValueError` if a coefficient is not a finite real number or array; and when the
-    solve is traced, if a shape does not fit `p`.
     """
-    if coefficients is None:
-        raise ValueError(
-            f"{COEFFICIENTS} must be {_FORMS}, but got None. For one force per "
-            "velocity write `ViscousDamping(1.0)`."
-        )
-    if callable(coefficients) and not is_operator(coefficients):
-        check_callable(coefficients, COEFFICIENTS[1:-1], "C(t, q, args)")
-        return LocalFriction(coefficients, per_velocity=True)
-    return ViscousFriction(as_form(coefficients, COEFFICIENTS))
+
+    coefficients: Form | Callable
+    per_velocity: ClassVar[bool] = True
+
+    def __init__(self, coefficients):
+        """**Arguments:**
+
+        - `coefficients`: `C`, in units of force per velocity (torque per angular
+            velocity for an angle), of any sign, in any of these forms.
+            - A number: the same for every degree of freedom.
+            - An array with as many dimensions as `p`, and broadcastable to it: a
+                coefficient for each degree of freedom.
+            - A square matrix, with `p` a vector; not necessarily symmetric.
+            - An array with one dimension more than `p`: a matrix for each vector over
+                the last axis of `p`. For the same matrix of `n` particles in three
+                dimensions, with `p` of shape `(n, 3)`, pass shape `(1, 3, 3)`.
+            - A pytree of the structure of `p`, whose leaves are any of the above.
+            - A `lineax.AbstractLinearOperator`, with `p` a vector. It is used as its
+                matrix.
+            - A function `C(t, q, args)` that returns any of the above but operators.
+
+        **Raises:**
+
+        `ValueError` if a coefficient is not a finite real number or array; and when the
+        solve is traced, if a shape does not fit `p`.
+        """
+        if coefficients is None:
+            raise ValueError(
+                f"{COEFFICIENTS} must be {_FORMS}, but got None. For one force per "
+                "velocity write `ViscousDamping(1.0)`."
+            )
+        if callable(coefficients) and not is_operator(coefficients):
+            check_callable(coefficients, COEFFICIENTS[1:-1], "C(t, q, args)")
+            self.coefficients = coefficients
+        else:
+            self.coefficients = as_form(coefficients, COEFFICIENTS)
+
+    @property
+    def _function(self) -> Callable | None:
+        """Of time and place, if they are no constants."""
+        x = self.coefficients
+        return x if callable(x) and not is_operator(x) else None
+
+    def parts(self, mechanics: Mechanics) -> Parts:
+        if mechanics.mass_varies:
+            return Parts(forces=(self,))
+        needs_mass(mechanics, "ViscousDamping")
+        if self._function is not None:
+            return Parts(local=(self,))
+        return Parts((LinearPart(LinearScale(), self.coefficients, per_velocity=True),))
+
+    def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
+        product = multiply(self.at(t, q, args), v, COEFFICIENTS, "v")
+        return tree.scale(-1, product)
+
+    def at(self, t: Time, q: PyTree, args: PyTree) -> Form:
+        """The coefficients at a time and a place."""
+        if self._function is None:
+            return self.coefficients
+        return arrays(self._function(t, q, args), _FUNCTION)
 
 
-def PositionDamping(rate: Callable) -> LocalFriction:
+class PositionDamping(AbstractFriction):
     """Friction `-Γ(t, q) p` at a rate that depends on place: absorbing layers, media,
     contact with a fluid.
 
@@ -165,19 +161,37 @@ def PositionDamping(rate: Callable) -> LocalFriction:
     The function is evaluated once per kick. A matrix is exponentiated in every kick.
     For friction per velocity write `ViscousDamping` with a function. Where the rate
     does not depend on place `ConstantDamping` is more efficient.
-
-    **Arguments:**
-
-    - `rate`: the rate `Γ`, in units of one over time, a function `rate(t, q, args)`
-        that returns a number; an array with as many dimensions as `p` that broadcasts
-        to it, a rate for each degree of freedom; a square matrix, with `p` a vector; or
-        a pytree of the structure of `p` of these.
-
-    **Raises:**
-
-    `ValueError` if it is not a function, and when the solve is traced if it returns
-    values of the wrong shape.
     """
-    instead = " For a rate that does not depend on place write `ConstantDamping(rate)`."
-    check_callable(rate, "PositionDamping(rate)", "rate(t, q, args)", instead=instead)
-    return LocalFriction(rate, per_velocity=False)
+
+    rate: Callable
+    per_velocity: ClassVar[bool] = False
+
+    def __init__(self, rate: Callable):
+        """**Arguments:**
+
+        - `rate`: the rate `Γ`, in units of one over time, a function `rate(t, q, args)`
+            that returns a number; an array with as many dimensions as `p` that
+            broadcasts to it, a rate for each degree of freedom; a square matrix, with
+            `p` a vector; or a pytree of the structure of `p` of these.
+
+        **Raises:**
+
+        `ValueError` if it is not a function, and when the solve is traced if it returns
+        values of the wrong shape.
+        """
+        instead = (
+            " For a rate that does not depend on place write `ConstantDamping(rate)`."
+        )
+        name = "PositionDamping(rate)"
+        check_callable(rate, name, "rate(t, q, args)", instead=instead)
+        self.rate = rate
+
+    def parts(self, mechanics: Mechanics) -> Parts:
+        return Parts(local=(self,))
+
+    def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
+        return tree.scale(-1, multiply(self.at(t, q, args), p, DAMPING, "p"))
+
+    def at(self, t: Time, q: PyTree, args: PyTree) -> PyTree:
+        """The rates at a time and a place."""
+        return arrays(self.rate(t, q, args), _FUNCTION)

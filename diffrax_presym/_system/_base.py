@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Inexact, PyTree
 from .. import _tree as tree
 from .._checks import describe, match
 from .._friction._base import AbstractFriction, Mechanics, Parts
-from .._friction._damping import Damping
+from .._friction._damping import AbstractDamping
 from .._friction._fit import fit_friction, one_rate
 from .._friction._linear import LinearFriction
 from .._numbers import as_time, Scalar, State, Time
@@ -178,7 +178,7 @@ class AbstractSystem(dfx.AbstractTerm):
         return force if friction is None else friction.net_force(t, force, p)
 
     @property
-    def damping(self) -> Damping | None:
+    def damping(self) -> AbstractDamping | None:
         """The law of friction, if that is one rate for all momenta; `ValueError` if
         there is other friction."""
         return one_rate(self.parts)

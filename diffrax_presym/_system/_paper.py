@@ -9,7 +9,7 @@ from jaxtyping import PyTree
 from .. import _tree as tree
 from .._checks import scalar_fn
 from .._friction._base import Mechanics, Parts
-from .._friction._damping import as_laws, ConstantDamping, Damping
+from .._friction._damping import AbstractDamping, as_laws, ConstantDamping
 from .._friction._fit import fit_friction, one_rate
 from .._friction._linear import LinearFriction
 from .._numbers import as_time, Scalar, Time
@@ -52,7 +52,7 @@ def DissipativeHamiltonian(kinetic, potential, eta1, eta2) -> MechanicalSystem:
     return MechanicalSystem(kinetic, potential, eta2)
 
 
-def _as_damping(law, name: str) -> Damping:
+def _as_damping(law, name: str) -> AbstractDamping:
     mechanics = Mechanics()
     parts = sum((x.parts(mechanics) for x in as_laws(law, name)), Parts())
     damping = one_rate(parts)
@@ -62,8 +62,8 @@ def _as_damping(law, name: str) -> Damping:
 class _ScaledKinetic(AbstractKinetic):
     # exp(-eta1 - eta2) T(exp(eta2) p), as exp(eta2 - eta1) times the rescaled T.
     kinetic: AbstractKinetic
-    eta1: Damping
-    eta2: Damping
+    eta1: AbstractDamping
+    eta2: AbstractDamping
     is_autonomous: ClassVar[bool] = False
 
     @property

@@ -4,7 +4,12 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool
 
 from .._checks import as_positive
-from .._friction._damping import as_friction, ConstantDamping, Damping, LogDamping
+from .._friction._damping import (
+    AbstractDamping,
+    as_friction,
+    ConstantDamping,
+    LogDamping,
+)
 from .._numbers import cast_to, Scalar, Time
 
 
@@ -20,8 +25,8 @@ class Scaling(eqx.Module):
     hold.
     """
 
-    gamma: Damping
-    beta: Damping | None
+    gamma: AbstractDamping
+    beta: AbstractDamping | None
     C: Scalar
 
     def __init__(self, gamma, beta=None, C: ArrayLike = 1.0):
@@ -62,9 +67,9 @@ class Scaling(eqx.Module):
         return valid & (self.beta.rate(t) <= (1 + tolerance) * rate)
 
 
-def _as_damping(law, name: str) -> Damping:
+def _as_damping(law, name: str) -> AbstractDamping:
     law = as_friction(law, name)
-    if not isinstance(law, Damping):
+    if not isinstance(law, AbstractDamping):
         raise ValueError(f"{name} must be a function of time, but got {law!r}.")
     return law
 
