@@ -15,6 +15,7 @@ from helpers import (
 
 import diffrax_presym as dps
 from diffrax_presym import diagnostics
+from diffrax_presym.diagnostics import energy_lost
 
 
 Y0 = (jnp.array([1.0]), jnp.array([0.3]))
@@ -58,6 +59,29 @@ def test_energy_error_of_a_conserved_energy_is_its_change():
     ts, ys = jnp.array([0.0, 1.0]), (jnp.array([[1.0], [2.0]]), jnp.zeros((2, 1)))
     error = diagnostics.energy_error(term, ts, ys)
     assert_close(error, jnp.array([0.0, 1.5]), 1e-15)
+
+
+def test_energies_of_a_rigid_body():
+    inertia = np.array([1.0, 1.5, 2.5])
+    height = lambda t, q, args: 2 * dps.rotation_matrix(q)[2, 2]
+    slowed = dps.ManifoldSystem(dps.Attitude(inertia), height, dps.ViscousDamping(0.2))
+    y0 = jnp.array([0.8, 0.6, 0.0, 0.0]), jnp.array([0.5, -1.0, 2.0])
+    ts = jnp.linspace(0.0, 2.0, 5)
+    ys = dfx.diffeqsolve(
+        *(slowed, dps.BlanesMoan6(), 0.0, 2.0, 0.05, y0),
+        saveat=dfx.SaveAt(ts=ts),
+        adjoint=dps.FixedStepAdjoint(),
+    ).ys
+    assert ys is not None
+    power = diagnostics.power_lost(slowed, ts, ys)
+    assert_close(power, 0.2 * np.sum((np.asarray(ys[1]) / inertia) ** 2, axis=1), 1e-14)
+    energy, lost = (f(slowed, ts, ys) for f in (diagnostics.energy, energy_lost))
+    assert lost[-1] > 0.1
+    assert_close(energy[0] - energy, lost, 1e-8)
+    assert np.max(np.abs(diagnostics.energy_error(slowed, ts, ys))) < 1e-8
+    with pytest.raises(ValueError, match="needs local coordinates"):
+        args = slowed, dps.Strang(), 0.0, 0.1
+        diagnostics.structure_defect(*args, (ys[0][0], ys[1][0]))
 
 
 @pytest.mark.parametrize(

@@ -106,14 +106,14 @@ def _energy(system: AbstractSystem, t, y: State, args: PyTree):
 def _power(system: AbstractSystem, t, y: State, args: PyTree):
     """The power of all that changes the energy."""
     energy = lambda t, q, p: system.energy(t, q, p, args)
-    explicit, slope, _ = jax.grad(energy, argnums=(0, 1, 2))(t, *y)
-    velocity, force = system.vf(t, y, args)
-    done = tree.dot(velocity, tree.add(force, slope))
+    explicit, *slopes = jax.grad(energy, argnums=(0, 1, 2))(t, *y)
+    done = tree.dot(slopes, list(system.vf(t, y, args)))
     return cast_to(explicit, done) + done
 
 
 def _power_lost(system: AbstractSystem, t, y: State, args: PyTree):
-    velocity = system.velocity(t, *y, args)
+    # Of bodies the angular velocity, where `system.velocity` is that of quaternions.
+    velocity = jax.grad(lambda p: system.energy(t, y[0], p, args))(y[1])
     return -tree.dot(velocity, system.friction_force(t, *y, args))
 
 

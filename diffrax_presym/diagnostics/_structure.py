@@ -41,8 +41,15 @@ def structure_defect(
 
     **Raises:**
 
-    `ValueError` if the system has other friction, or for a multistep method.
+    `ValueError` if the system has other friction or a manifold, or for a multistep
+    method.
     """
+    if system.is_constrained:
+        raise ValueError(
+            "`structure_defect` needs local coordinates, but the state of a "
+            f"`{type(system).__name__}` is on a manifold or constraints. Write it in "
+            "such coordinates, as a `LagrangianSystem`."
+        )
     force = getattr(system, "external", None)
     if not has_one_rate(system.parts) or force is not None:
         raise ValueError(
