@@ -50,8 +50,8 @@ class System:
     q: Any
     p: Any
     offers: frozenset[str]  # the splits that it offers without friction
-    # The friction that it takes: "all", "velocities", "rates", "joints", "time", "one
-    # rate" or "none".
+    # The friction that it takes: "all", "velocities", "rates", "joints", "tangential",
+    # "one rate" or "none".
     takes: str
     mass: Any = None
     bodies: bool = False  # whether the last axis are the coordinates of bodies
@@ -304,9 +304,7 @@ def _whirl_force(t, q, p):
 
 def _manifold(manifold, potential):
     def build(laws, force=None):
-        if force is not None:
-            raise ValueError("write `MechanicalSystem`")
-        return dps.ManifoldSystem(manifold, potential, laws)
+        return dps.ManifoldSystem(manifold, potential, laws, force=force)
 
     return build
 
@@ -404,7 +402,10 @@ def _form(t, q, args):
 
 def _form_force(t, q, p):
     slope = np.array([2 * q[0], q[2], q[1] - 1])
-    force = -(1 + np.cos(t) / 2) * slope / 2
+    return -(1 + np.cos(t) / 2) * slope / 2
+
+
+def _form_react(t, q, p, force):
     return force - (q @ force + p @ p) * q
 
 
@@ -503,8 +504,8 @@ SYSTEMS = [
     ),
     System(
         *("rigid body", _manifold(dps.Attitude(_INERTIA), _top)),
-        *(_top_velocity, _top_force, _TURNED, _SPIN, frozenset({"any"}), "time"),
-        mass=np.diag(_INERTIA),
+        *(_top_velocity, _top_force, _TURNED, _SPIN, frozenset({"any"}), "all"),
+        *(np.diag(_INERTIA), True),
         constrained=True,
     ),
     System(
@@ -513,16 +514,18 @@ SYSTEMS = [
             _manifold((dps.Euclidean(2.0), dps.Attitude(_INERTIA)), _hanging_potential),
             _joint,
         ),
-        *(_hanging_velocity, _hanging_force, *_HANGING, frozenset({"any"}), "time"),
-        mass=_FLOATING,
+        *(_hanging_velocity, _hanging_force, *_HANGING, frozenset({"any"}), "all"),
+        *(_FLOATING, True),
         constrained=True,
         slow=True,
         react=_hanging_react,
     ),
     System(
         *("sphere", _manifold(dps.Sphere(), _form), _own, _form_force),
-        *(_VECTOR, _SPIN, frozenset({"any"}), "time"),
+        *(_VECTOR, _SPIN, frozenset({"any"}), "tangential"),
+        bodies=True,
         constrained=True,
+        react=_form_react,
     ),
 ]
 
@@ -1002,12 +1005,10 @@ def offered(system: System, friction: Friction) -> frozenset[str] | Refused:
         return Refused("its own friction")
     if system.takes == "one rate" and kind != "one rate":
         return Refused("one rate")
-    if system.constrained and friction.external is not None:
-        return Refused("not by a force of the velocity")
-    if system.takes == "time" and kind in ("place", "drag"):
-        return Refused("not of time alone")
-    if system.takes == "time" and system.mass is None and kind != "one rate":
-        return frozenset()
+    if system.takes == "tangential":
+        # In drifts one rate, in kicks any friction along the manifold.
+        linear = kind in ("entries", "matrix") or friction.name.startswith("[matrix")
+        return frozenset() if linear else system.offers
     if system.takes == "joints":
         return Refused("not of joints") if friction.needs == "bodies" else frozenset()
     if friction.needs == "mass" and system.takes == "velocities":

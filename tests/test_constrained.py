@@ -1,7 +1,7 @@
 """Constraints: orders and gradients with any friction, against SciPy on the equations
 with multipliers, or in coordinates that need none."""
 
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import diffrax as dfx
@@ -23,7 +23,14 @@ MASS = np.array([[2.0, 0.3, 0.0], [0.3, 1.0, 0.1], [0.0, 0.1, 1.5]])
 C = np.array([[0.5, 0.2, 0.0], [-0.2, 0.6, 0.3], [0.0, -0.3, 0.4]])
 ONE = np.eye(3)
 
-# The law of friction, its force of position and velocity, and the mass.
+
+def motor(np, q, v):
+    """A motor about the axis, and smoothed dry friction."""
+    about = np.stack([-q[1], q[0], 0 * q[0]])
+    return (1 - about @ v) * about - np.tanh(2 * v)
+
+
+# The law of friction or a force, its force of position and velocity, and the mass.
 FRICTION = {
     "none": (None, lambda q, v: 0 * v, ONE),
     "rate": (dps.ConstantDamping(0.3), lambda q, v: -0.3 * MASS @ v, MASS),
@@ -34,6 +41,7 @@ FRICTION = {
         MASS,
     ),
     "drag": (dps.Drag(0.4), lambda q, v: -0.4 * np.linalg.norm(v) * v, ONE),
+    "force": (lambda t, q, v, args: motor(jnp, q, v), partial(motor, np), MASS),
 }
 SCHEMES = {
     "Strang": (dps.Strang(), 2),
@@ -52,7 +60,8 @@ def breathing_sphere(friction, **options):
     kinetic = dps.QuadraticKinetic(None if mass is ONE else mass)
     potential = lambda t, q, args: G * q[2] * (1 + 0.3 * jnp.sin(t))
     sphere = lambda t, q, args: q @ q - (1 + 0.1 * jnp.sin(t)) ** 2
-    free = dps.MechanicalSystem(kinetic, potential, law)
+    laws = {"force": law} if friction == "force" else {"friction": law}
+    free = dps.MechanicalSystem(kinetic, potential, **laws)
     return dps.ConstrainedSystem(free, sphere, **options)
 
 
@@ -450,11 +459,7 @@ def test_arguments():
     system, g = sphere().system, lambda t, q, args: q @ q - 1
     wrong = {
         "needs a `MechanicalSystem`": (dps.Hamiltonian(lambda t, q, p, args: p @ p), g),
-        "needs a mass": (dps.MechanicalSystem(lambda t, p, args: p @ p, g), g),
-        "no `force=f`": (
-            dps.MechanicalSystem(dps.QuadraticKinetic(), g, force=lambda t, q, v, a: v),
-            g,
-        ),
+        "needs a constant mass": (dps.MechanicalSystem(lambda t, p, args: p @ p, g), g),
         "`constraint` must be a function": (system, 1.0),
     }
     for message, args in wrong.items():

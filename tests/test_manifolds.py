@@ -27,6 +27,7 @@ L = np.array([0.3, -0.8, 0.6])
 FORM = np.diag([1.0, 2.0, 3.0, 5.0]) + 0.2
 MATRIX = rng.standard_normal((4, 2))
 SQUARE = rng.standard_normal((3, 3))
+FIELD = np.array([[0, 1, 0, 0.5], [-1, 0, 0.2, 0], [0, -0.2, 0, 1], [-0.5, 0, -1, 0]])
 
 
 def hat(w):
@@ -54,16 +55,41 @@ def top_potential(t, q, args):
     return (1 + 0.2 * jnp.sin(t)) * dps.rotation_matrix(q)[2, 2]
 
 
-def top_field(gamma):
+def top_field(gamma, torque=lambda R, omega: 0.0):
     def field(t, y):
         R, p = y[:9].reshape(3, 3), y[9:]
         slope = np.zeros((3, 3))
         slope[2, 2] = gravity(t)
         rates = gamma(t) if callable(gamma) else gamma
         dR, dp = body_rates(R, p, slope, rates)
-        return np.concatenate([np.ravel(dR), dp])
+        return np.concatenate([np.ravel(dR), dp + torque(R, p / INERTIA)])
 
     return field
+
+
+def tilt(t, q, args):
+    """The coefficient of friction of a top that touches a fluid."""
+    return 1 + dps.rotation_matrix(q)[2, 2]
+
+
+def control(t, q, omega, args):
+    """Turns the axis upright, by wheels of limited torque."""
+    up = dps.rotation_matrix(q)[2]
+    zero = jnp.zeros_like(up[0])
+    return jnp.tanh(jnp.stack([up[1], -up[0], zero]) - omega**3)
+
+
+def control_in_numpy(R, omega):
+    return np.tanh([R[2, 1], -R[2, 0], 0] - omega**3)
+
+
+def drag_at_the_arm(t, q, v, args):
+    """Drag by the speed squared of a sail off the centre."""
+    (_, attitude), (v, omega) = q, v
+    R, arm = dps.rotation_matrix(attitude), ARM.astype(v.dtype)
+    at = v + R @ jnp.cross(omega, arm)
+    force = -jnp.linalg.norm(at) * at
+    return force, jnp.cross(arm, R.T @ force)
 
 
 def floating_potential(t, q, args):
@@ -71,17 +97,28 @@ def floating_potential(t, q, args):
     return jnp.sum((x + dps.rotation_matrix(attitude) @ ARM.astype(x.dtype)) ** 2)
 
 
-def floating_field(t, y):
-    x, R, px, p = y[:3], y[3:12].reshape(3, 3), y[12:15], y[15:]
-    tip = x + R @ ARM
-    dR, dp = body_rates(R, p, 2 * np.outer(tip, ARM), 0.3 * np.eye(3))
-    return np.concatenate([px / 2, np.ravel(dR), -2 * tip - 0.1 * px, dp])
+def floating_field(drag):
+    def field(t, y):
+        x, R, px, p = y[:3], y[3:12].reshape(3, 3), y[12:15], y[15:]
+        tip = x + R @ ARM
+        dR, dp = body_rates(R, p, 2 * np.outer(tip, ARM), 0.3 * np.eye(3))
+        at = px / 2 + R @ np.cross(p / INERTIA, ARM)
+        force = -drag * np.linalg.norm(at) * at
+        dp += np.cross(ARM, R.T @ force)
+        return np.concatenate([px / 2, np.ravel(dR), -2 * tip - 0.1 * px + force, dp])
+
+    return field
 
 
-def orthonormal(gamma, slope, shape):
+def turned(p):
+    """A magnetic force, and one that limits the speed."""
+    return FIELD @ p - (1 + np.sum(p**2)) * p
+
+
+def orthonormal(gamma, slope, shape, other=lambda q, p: 0.0):
     def field(t, y):
         q, p = (x.reshape(shape) for x in np.split(y, 2))
-        force = -slope(q)
+        force = other(q, p) - slope(q)
         both = q.T @ force
         tangential = force - q @ (both + both.T) / 2
         rates = p, tangential - gamma(t) * p - q @ (p.T @ p)
@@ -128,7 +165,53 @@ CASES = {
             (dps.Euclidean(2.0), dps.Attitude(INERTIA)),
             *(floating_potential, dps.ConstantDamping((0.1, 0.3))),
         ),
-        *(((np.ones(3), Q), (L, 2 * L)), floating_field),
+        *(((np.ones(3), Q), (L, 2 * L)), floating_field(0.0)),
+    ),
+    "floating body, drag": (
+        dps.ManifoldSystem(
+            (dps.Euclidean(2.0), dps.Attitude(INERTIA)),
+            *(floating_potential, dps.ConstantDamping((0.1, 0.3))),
+            force=drag_at_the_arm,
+        ),
+        *(((np.ones(3), Q), (L, 2 * L)), floating_field(1.0)),
+    ),
+    "top, place": (
+        dps.ManifoldSystem(
+            dps.Attitude(INERTIA), top_potential, dps.ViscousDamping(tilt)
+        ),
+        *((Q, L), top_field(0.0 * DAMPERS, lambda R, w: -(1 + R[2, 2]) * w)),
+    ),
+    "top, drag": (
+        dps.ManifoldSystem(dps.Attitude(INERTIA), top_potential, dps.Drag(0.4)),
+        *((Q, L), top_field(0.0 * DAMPERS, lambda R, w: -0.4 * np.linalg.norm(w) * w)),
+    ),
+    "top, controlled": (
+        dps.ManifoldSystem(
+            *(dps.Attitude(INERTIA), top_potential, dps.ViscousDamping(DAMPERS)),
+            force=control,
+        ),
+        *((Q, L), top_field(DAMPERS / INERTIA, control_in_numpy)),
+    ),
+    "sphere, place": (
+        dps.ManifoldSystem(
+            *(dps.Sphere(), form),
+            dps.PositionDamping(lambda t, q, args: 0.3 + q[0] ** 2),
+        ),
+        (MATRIX[:, 0], MATRIX[:, 1]),
+        orthonormal(
+            *(lambda t: 0.3, lambda q: FORM @ q, (4, 1)),
+            lambda q, p: -(q[0, 0] ** 2) * p,
+        ),
+    ),
+    "Stiefel, force": (
+        dps.ManifoldSystem(
+            *(dps.Stiefel(), form, dps.ConstantDamping(0.2)),
+            force=lambda t, q, v, args: FIELD @ v - (1 + jnp.sum(v**2)) * v,
+        ),
+        (MATRIX, MATRIX[::-1]),
+        orthonormal(
+            *(lambda t: 0.2, lambda q: FORM @ q, (4, 2)), lambda q, p: turned(p)
+        ),
     ),
     "sphere": (
         dps.ManifoldSystem(dps.Sphere(), form, dps.LogDamping(3.0, 1.0)),
@@ -170,7 +253,7 @@ def flat(case, y):
     q, p = jax.tree.map(np.asarray, y)
     if "top" in case:
         q = matrix(q)
-    if case == "floating body":
+    if "floating body" in case:
         q = q[0], matrix(q[1])
     return np.concatenate([np.ravel(x) for x in jax.tree.leaves((q, p))])
 
@@ -318,8 +401,12 @@ def test_gradient(case, gradient):
     @jax.jit
     def loss(x):
         moved = jax.tree.map(lambda y: y * jnp.where(y > 0, x[0], 1.0), y0)
-        changed = jax.tree.map(lambda y: x[1] * y, system.friction)
-        new = dps.ManifoldSystem(system.manifold, system.potential, changed)
+        scale = lambda tree: jax.tree.map(lambda y: x[1] * y, tree)
+        numbers, rest = eqx.partition(system.friction, eqx.is_inexact_array_like)
+        changed = eqx.combine(scale(numbers), rest)
+        force = system.external and (lambda *at: scale(system.external(*at)))
+        fields = system.manifold, system.potential, changed
+        new = dps.ManifoldSystem(*fields, force=force)
         ys = diffeqsolve(
             *(new, solver, 0.0, 1.0, 0.1, new.project(0.0, moved)),
             saveat=dfx.SaveAt(ts=ts),
@@ -391,8 +478,8 @@ def test_arguments():
     flat = lambda t, q, args: 0.0 * jnp.sum(q)
     with pytest.raises(ValueError, match=r"needs a manifold such as `Sphere\(\)`"):
         dps.ManifoldSystem(dps.Sphere, flat)
-    with pytest.raises(ValueError, match="friction that depends on time alone"):
-        dps.ManifoldSystem(dps.Sphere(), flat, dps.PositionDamping(lambda t, q, a: 1.0))
+    with pytest.raises(ValueError, match=r"`force` must be a function `f\(t, q, v"):
+        dps.ManifoldSystem(dps.Sphere(), flat, force=lambda t, q: q)
     with pytest.raises(ValueError, match="three principal moments"):
         dps.Attitude(jnp.ones(2))
     with pytest.raises(ValueError, match="must be positive"):

@@ -165,7 +165,7 @@ class AbstractSystem(dfx.AbstractTerm):
         if external is None:
             return force
         value = external(t, q, v, args)
-        return tree.add(force, match(value, q, "`force`", "`q`"))
+        return tree.add(force, match(value, v, "`force`", "the velocity"))
 
     def fit_friction(self, p: P) -> LinearFriction | None:
         """The linear friction that depends on time alone, for momenta like `p`."""

@@ -17,6 +17,7 @@ from .._friction._linear import LinearFriction
 from .._numbers import as_time, Scalar, State, Time
 from ._base import AbstractSystem, P, Q
 from ._constrained_split import ConstrainedSplit
+from ._force_split import AbstractForceSplit
 from ._kinetic import QuadraticKinetic
 from ._manifold import ManifoldSystem
 from ._mechanical import MechanicalSystem
@@ -72,9 +73,9 @@ class ConstrainedSystem(AbstractSystem):
     ):
         """**Arguments:**
 
-        - `system`: a `MechanicalSystem` with a quadratic kinetic energy, any friction,
-            and forces that do not depend on the velocity otherwise; or a
-            `ManifoldSystem`, such as rigid bodies that are joined.
+        - `system`: a `MechanicalSystem` with a quadratic kinetic energy, or a
+            `ManifoldSystem`, such as rigid bodies that are joined; with any friction
+            and any forces of the velocity.
         - `constraint`: a function `g(t, q, args)` that returns an array, zero where the
             constraints hold, or a scalar.
         - `linear_solver`: a Lineax solver for the multipliers. Defaults to `None`, by
@@ -86,9 +87,9 @@ class ConstrainedSystem(AbstractSystem):
 
         **Raises:**
 
-        `ValueError` if any is of the wrong kind, if the system has a kinetic energy or
-        a force that is not supported, and when the solve is traced if the constraint
-        returns something else. A solve from a state that is off the constraint fails.
+        `ValueError` if any is of the wrong kind, if the system has another kinetic
+        energy, and when the solve is traced if the constraint returns something else. A
+        solve from a state that is off the constraint fails.
         """
         if not isinstance(system, MechanicalSystem | ManifoldSystem):
             raise ValueError(
@@ -96,14 +97,11 @@ class ConstrainedSystem(AbstractSystem):
                 f"a `ManifoldSystem`, but got {type(system).__name__}. Write the "
                 "constraint in Cartesian coordinates, in which the mass is constant."
             )
-        if isinstance(system, MechanicalSystem) and (
-            system.external is not None
-            or not isinstance(system.kinetic, QuadraticKinetic)
+        if isinstance(system, MechanicalSystem) and not isinstance(
+            system.kinetic, QuadraticKinetic
         ):
             raise ValueError(
-                "`ConstrainedSystem` needs a mass, `QuadraticKinetic(mass)`, and no "
-                "`force=f` that depends on the velocity. Write a force of time and "
-                "place as `ForceField`, and friction as `friction=`."
+                "`ConstrainedSystem` needs a constant mass, `QuadraticKinetic(mass)`."
             )
         check_callable(constraint, "constraint", "g(t, q, args)")
         if not isinstance(linear_solver, lx.AbstractLinearSolver | None):
@@ -140,7 +138,9 @@ class ConstrainedSystem(AbstractSystem):
 
     @property
     def splits(self) -> tuple[AbstractSplit, ...]:
-        return (ConstrainedSplit(self.system.splits[0]),)
+        (split, *_) = self.system.splits
+        assert isinstance(split, AbstractForceSplit)
+        return (ConstrainedSplit(split),)
 
     def value(self, t: Time, q: Q, args: PyTree) -> Multipliers:
         """The constraints, as a vector."""

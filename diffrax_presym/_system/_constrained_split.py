@@ -15,7 +15,7 @@ from .._compositions import lengths
 from .._numbers import State
 from .._results import CONSTRAINT_NOT_SOLVED, NOT_REVERSIBLE, SUCCESSFUL
 from ._bound import System
-from ._manifold import ManifoldSplit
+from ._force_split import AbstractForceSplit
 from ._multipliers import find_root, Multipliers
 from ._split import AbstractSplit
 
@@ -32,8 +32,12 @@ class ConstrainedSplit(AbstractSplit):
     It is symmetric, of second order, and composed to the order that is needed.
     """
 
-    base: AbstractSplit
+    base: AbstractForceSplit
     kinds: ClassVar[frozenset[str]] = frozenset({"any"})
+
+    @property
+    def failure(self):
+        return self.base.failure
 
     def prepare(self, system, t, h, order) -> PyTree:
         free, h = _free(system), lengths(order, h)
@@ -87,18 +91,13 @@ class ConstrainedSplit(AbstractSplit):
 
     def force(self, system, t, y) -> PyTree:
         force, (q, _) = self.base.force(_free(system), t, y), tree.values(y)
-        if not self._is_plain:
+        if self.base.kick_by != "force":
             return force
         change = system.term.to_tangent(t, q, force, system.args, flow=0.0)
         return tree.add(force, change)
 
-    @property
-    def _is_plain(self) -> bool:
-        """Whether a kick is by a force alone."""
-        return "separable" in self.base.kinds or isinstance(self.base, ManifoldSplit)
-
     def kick(self, system, t, h, y, force, order) -> State:
-        if self._is_plain:
+        if self.base.kick_by == "force":
             return self.base.kick(_free(system), t, h, y, force, order)
         stage = lambda y, h: (self._kick_stage(system, t, h, y, force, order), None)
         return lax.scan(stage, y, lengths(order, h))[0]

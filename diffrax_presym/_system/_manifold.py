@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import ClassVar
 
+import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
 from .. import _tree as tree
-from .._checks import describe, match
+from .._checks import check_callable, describe, match
 from .._compositions import lengths
 from .._forms import divide
 from .._friction._base import AbstractFriction, MASS, Mechanics
@@ -19,6 +20,7 @@ from .._friction._linear import LinearFriction
 from .._numbers import cast_to, Scalar, State, Time
 from ._base import AbstractSystem, P, Q
 from ._bound import System
+from ._force_split import AbstractForceSplit
 from ._manifolds import AbstractManifold
 from ._potential import AbstractPotential, as_potential, ForceField
 from ._split import AbstractSplit
@@ -31,8 +33,10 @@ class ManifoldSystem(AbstractSystem):
     """A mechanical system on a manifold whose free motion is known, with friction.
 
     Positions are in ambient coordinates. Drifts are free motions along geodesics, which
-    friction at a rate shortens; other friction is composed with them. Kicks are
-    tangential. `Strang`, `BlanesMoan4`, `BlanesMoan6` and compositions keep their
+    friction at a rate shortens; other linear friction that depends on time alone is
+    composed with them. Kicks are tangential, and those by other friction or a `force`
+    of the velocity solve an equation for the momentum, symmetric and to the order of
+    the scheme. `Strang`, `BlanesMoan4`, `BlanesMoan6` and compositions keep their
     order, and positions stay on the manifold to rounding. Start from
     `system.project(t0, y0)`. In Diffrax's loop save values between steps by
     `SaveAt(ts=ts, fn=system.project)`.
@@ -53,10 +57,11 @@ class ManifoldSystem(AbstractSystem):
     manifold: PyTree[AbstractManifold]
     potential: AbstractPotential
     friction: tuple[AbstractFriction, ...] | None
+    external: Callable | None
     is_constrained: ClassVar[bool] = True
     drift_is_autonomous: ClassVar[bool] = True
 
-    def __init__(self, manifold, potential, friction=None):
+    def __init__(self, manifold, potential, friction=None, *, force=None):
         """**Arguments:**
 
         - `manifold`: where the positions are, such as `Sphere()`, or a pytree of
@@ -64,8 +69,14 @@ class ManifoldSystem(AbstractSystem):
         - `potential`: the potential energy, a function `V(t, q, args)` that returns a
             scalar; or a `ForceField` of forces on the momenta, and torques along the
             axes of bodies.
-        - `friction`: a law of friction that depends on time alone, or a list. Of a
-            `Sphere` or a `Stiefel` one rate. Defaults to none.
+        - `friction`: a law of friction, or a list, with coefficients and rates for
+            the entries of momenta. Of a `Sphere` or a `Stiefel` one rate if it depends
+            on time alone. Defaults to none.
+        - `force`: any further force, a function `f(t, q, v, args)` of the velocity
+            `v`, of the structure and shape of `p`: a motor, a controller, friction
+            between bodies. For an `Attitude` the velocity is angular, and the force a
+            torque, along the axes of the body; elsewhere its part along the manifold
+            acts. As of `MechanicalSystem`. Defaults to none.
 
         **Raises:**
 
@@ -79,12 +90,9 @@ class ManifoldSystem(AbstractSystem):
                 f"or a pytree of manifolds, but got {manifold!r}."
             )
         self.manifold, self.potential = manifold, as_potential(potential)
-        self.friction = as_laws(friction) or None
-        if any(self.parts[1:]):
-            raise ValueError(
-                "`ManifoldSystem` takes friction that depends on time alone. Write "
-                "`ConstantDamping(rate)` or `ViscousDamping(coefficients)`."
-            )
+        check_callable(force, "force", "f(t, q, v, args)", optional=True)
+        self.friction, self.external = as_laws(friction) or None, force
+        _ = self.parts  # An error if a law does not fit the system.
 
     def map(self, fn: Callable, *trees: PyTree) -> PyTree:
         """A function of each manifold and of parts of other trees."""
@@ -115,7 +123,13 @@ class ManifoldSystem(AbstractSystem):
 
     @property
     def splits(self) -> tuple[AbstractSplit, ...]:
-        return (ManifoldSplit(),)
+        parts, kick_by = self.parts, "force"
+        if parts.local:
+            # By the exponential of a rate, which is not along every manifold.
+            kick_by = "friction" if self.is_free else "momentum"
+        if self.external is not None or parts.drags or parts.forces:
+            kick_by = "momentum"
+        return (ManifoldSplit(kick_by),)
 
     def check_state(self, y: PyTree) -> None:
         wanted = jtu.tree_structure(self.manifold, is_leaf=_is_manifold)
@@ -174,7 +188,18 @@ class ManifoldSystem(AbstractSystem):
             return jax.jvp(lambda s: m.flow(q, p, s), (zero,), (one,))[1]
 
         velocity, force = self.pair(self.map(free, q, p))
-        return velocity, tree.add(force, self.kick(t, q, p, args))
+        force = tree.add(force, self.kick(t, q, p, args))
+        return velocity, self.add_forces(force, self.external, t, q, p, velocity, args)
+
+    def add_forces(
+        self, force: P, external: Callable | None, t: Time, q: Q, p: P, v: Q, args
+    ) -> P:
+        """As of any system, of velocities that are along the axes of bodies."""
+        if external is None and not any(self.parts[1:]):
+            return force
+        v = divide(self.mechanics.mass, p, MASS, "p")
+        other = super().add_forces(tree.zeros(p), external, t, q, p, v, args)
+        return tree.add(force, self.map(lambda m, q, x: m.project(q, x)[1], q, other))
 
     def to_momentum(self, q: Q, force: Q) -> P:
         """The rate of change of the momenta by a force in ambient coordinates."""
@@ -188,9 +213,10 @@ class ManifoldSystem(AbstractSystem):
         return self.map(lambda m, q, x: m.project(q, x)[1], q, force)
 
 
-class ManifoldSplit(AbstractSplit):
+class ManifoldSplit(AbstractForceSplit):
     """The free motion, with friction, and tangential kicks."""
 
+    kick_by: str = eqx.field(static=True)
     kinds: ClassVar[frozenset[str]] = frozenset({"any"})
 
     def quadrature(self, system, order) -> int:
@@ -229,7 +255,7 @@ class ManifoldSplit(AbstractSplit):
         q, p = term.pair(term.map(flow, q, p, data.leaves))
         return q, tree.add(p, friction.decay(data, p))
 
-    def force(self, system, t, y) -> PyTree:
+    def place_force(self, system, t, y) -> PyTree:
         return system.term.kick(t, *tree.values(y), system.args)
 
 

@@ -141,9 +141,9 @@ class MechanicalSystem(AbstractSystem):
     def splits(self) -> tuple[AbstractSplit, ...]:
         parts = self.parts
         if self.external is not None or parts.forces:
-            return (KineticSplit(frozenset({"any"}), is_implicit=True),)
+            return (KineticSplit(frozenset({"any"}), "momentum"),)
         if parts.local or parts.drags:
-            return (KineticSplit(frozenset({"any"})),)
+            return (KineticSplit(frozenset({"any"}), "friction"),)
         kinetic = self.kinetic
         nystrom = {"nystrom"} if kinetic.is_quadratic else set()
         kinds = frozenset({"separable", "any"} | nystrom)

@@ -1,22 +1,14 @@
 """The splits of mechanical systems."""
 
-import math
 from typing import ClassVar, TYPE_CHECKING
 
 import equinox as eqx
-import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from .. import _tree as tree
-from .._compositions import lengths
-from .._friction._base import LinearPart
-from .._friction._drag import Drag
-from .._friction._fit import fit_friction
-from .._friction._log_scale import LinearScale
-from .._numbers import as_time, State, Time
-from .._results import FORCE_NOT_SOLVED, NONFINITE
-from ._force_flow import force_flow
+from .._numbers import State, Time
+from ._force_split import AbstractForceSplit
 from ._split import AbstractSplit
 
 
@@ -24,27 +16,16 @@ if TYPE_CHECKING:
     from ._bound import System
 
 
-# The most friction over a kick back in time. It amplifies the distance of a momentum
-# from that of the slow motion. By `friction_limit` of a "push" and a "move" the schemes
-# of order four and more resolve from 4.6 (`SofroniouSpaletta(8, Strang())`) to 8.8.
-_MOST_BACK = math.log(100)
-
-
 def _potential_force(system: "System", t: Time, y: State) -> PyTree:
     return system.term.potential.force(t, tree.values(y)[0], system.args)
 
 
-class KineticSplit(AbstractSplit):
+class KineticSplit(AbstractForceSplit):
     """The drift is the flow of the kinetic energy and of linear friction, the kick that
-    of the potential and of friction that depends on place or speed: exact if that is
-    linear, otherwise a composition. A kick by any force of the velocity is implicit."""
+    of the potential and of friction that depends on place or speed."""
 
     kinds: frozenset[str] = eqx.field(static=True)
-    is_implicit: bool = eqx.field(static=True, default=False)
-
-    @property
-    def failure(self):
-        return FORCE_NOT_SOLVED if self.is_implicit else NONFINITE
+    kick_by: str = eqx.field(static=True, default="force")
 
     def quadrature(self, system, order) -> int:
         return 0 if system.term.kinetic.flow_is_known(system.friction) else order
@@ -56,55 +37,8 @@ class KineticSplit(AbstractSplit):
         kinetic, p = system.term.kinetic, tree.values(y)[1]
         return system.add(y, kinetic.flow(system.friction, t, h, data, p, system.args))
 
-    def force(self, system, t, y) -> PyTree:
-        """The force, and the other friction at the place if there is any."""
-        force = _potential_force(system, t, y)
-        if "separable" in self.kinds or self.is_implicit:
-            return force
-        parts, at = system.parts, (t, tree.values(y)[0], system.args)
-        forms = [part.at(*at) for part in parts.local]
-        return force, forms, [drag.at(*at) for drag in parts.drags]
-
-    def kick(self, system, t, h, y, force, order) -> State:
-        if "separable" in self.kinds:
-            return super().kick(system, t, h, y, force, order)
-        if self.is_implicit:
-            term, (q, p), args = system.term, tree.values(y), system.args
-            state = lambda p: (t, q, p, term.velocity(t, q, p, args), args)
-            total = lambda p: term.add_forces(force, term.external, *state(p))
-            dp, found = force_flow(total, h, p, order)
-            return system.add(y, (None, tree.invalid_if(~found, dp)))
-        (force, forms, drags), p = force, tree.values(y)[1]
-        parts, mechanics = system.parts, system.term.mechanics
-        pairs = zip(parts.local, forms, strict=True)
-        linear = [
-            LinearPart(LinearScale(), x, part.per_velocity, may_couple=True)
-            for part, x in pairs
-        ]
-        friction = fit_friction(linear, mechanics, p)
-
-        def pushed(dp: PyTree, h: Time) -> PyTree:
-            if friction is None:
-                return tree.add_scaled(dp, h, force)
-            bad = (as_time(h) < 0) & (friction.over(t, h) > _MOST_BACK)
-            data = tree.invalid_if(bad, friction.prepare(t, h, order))
-            gained = friction.decay(data, tree.add(p, dp))
-            return tree.add(dp, tree.add(gained, friction.respond(data, force)))
-
-        def slowed(drags: list[Drag], dp: PyTree, h: Time) -> PyTree:
-            for drag in drags:
-                dp = tree.add(dp, drag.decay(h, tree.add(p, dp), mechanics.mass))
-            return dp
-
-        def stage(dp: PyTree, h: Time) -> tuple[PyTree, None]:
-            dp = pushed(slowed(drags, dp, h / 2), h)
-            return slowed(drags[::-1], dp, h / 2), None
-
-        if drags:
-            dp = lax.scan(stage, tree.zeros(p), lengths(order, h))[0]
-        else:
-            dp = pushed(tree.zeros(p), h)
-        return system.add(y, (None, dp))
+    def place_force(self, system, t, y) -> PyTree:
+        return _potential_force(system, t, y)
 
 
 class PotentialSplit(AbstractSplit):
