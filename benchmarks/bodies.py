@@ -29,9 +29,8 @@ import scipy.integrate
 import scipy.special
 from _report import command_line, Table
 from _schemes import DIFFRAX
-from _solve import relative_error, states
+from _solve import integrated, relative_error, states
 from _timing import error_curves, least_to, ratios
-from jax.flatten_util import ravel_pytree
 from scipy.spatial.transform import Rotation
 
 import diffrax_presym as dps
@@ -108,16 +107,6 @@ def compare(caption, ours, theirs, simulate, exact, least, quick):
     table = Table(f"The least time of each over that of {OURS}", "of:<15", *columns)
     for group in (THEIRS, MUJOCO):
         table.row(group, *ratios(curves, TARGETS, group, OURS))
-
-
-def integrated(rates, y0, t1):
-    """The end, by SciPy's DOP853."""
-    flat, unravel = ravel_pytree(y0)
-    slope = jax.jit(lambda t, y: ravel_pytree(rates(t, unravel(y), None))[0])
-    field = lambda t, y: np.asarray(slope(t, y))
-    options: Any = {"method": "DOP853", "rtol": 3e-14, "atol": 1e-14}
-    ys = scipy.integrate.solve_ivp(field, (0.0, t1), flat, **options).y
-    return unravel(jnp.asarray(ys[:, -1]))
 
 
 # A free body.
@@ -223,7 +212,8 @@ def joints(t, q, args):
 
 
 def joined(n):
-    (force, torque), masses = drag(), jnp.ones((n, 1))
+    force, torque = drag()
+    masses: Any = jnp.ones((n, 1))
     rods = dps.Euclidean(masses), dps.Attitude(np.tile(INERTIA, (n, 1)))
     weight = lambda t, q, args: GRAVITY * jnp.sum(q[0][:, 2])
     law = dps.ViscousDamping((force, torque))
