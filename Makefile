@@ -23,8 +23,8 @@ EXAMPLES := $(sort $(filter-out examples/_%,$(wildcard examples/*.py)))
 # The experiments of the paper share code, so they are run as modules.
 PAPER := $(notdir $(basename $(filter-out examples/paper/_%,$(wildcard examples/paper/*.py))))
 BENCHMARKS := against_loop calls compile_time schemes tuning work_precision choose_step batches \
-	nonseparable gauss multistep friction forces variable_steps constraints manifolds hard_cases gradients saved \
-	samplers limits
+	nonseparable gauss multistep friction forces variable_steps constraints bodies manifolds hard_cases \
+	gradients saved samplers limits
 
 # Figures are saved to files, without a display.
 export MPLBACKEND ?= Agg

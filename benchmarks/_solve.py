@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.integrate
 from jax.flatten_util import ravel_pytree
 
 import diffrax_presym as dps
@@ -83,6 +84,17 @@ def relative_error(y, exact):
         np.concatenate([*map(np.ravel, jax.tree.leaves(x))]) for x in (y, exact)
     )
     return np.max(np.abs(y - exact)) / np.max(np.abs(exact))
+
+
+def integrated(rates, y0, t1) -> Any:
+    """The solution at `t1` of `y' = rates(t, y, args)`, by SciPy's DOP853: quicker to
+    compile than `reference`, and less accurate, about 1e-12."""
+    flat, unravel = ravel_pytree(y0)
+    slope = jax.jit(lambda t, y: ravel_pytree(rates(t, unravel(y), None))[0])
+    field = lambda t, y: np.asarray(slope(t, y))
+    options: Any = {"method": "DOP853", "rtol": 3e-14, "atol": 1e-14}
+    ys = scipy.integrate.solve_ivp(field, (0.0, t1), flat, **options).y
+    return unravel(jnp.asarray(ys[:, -1]))
 
 
 def reference_end(system, y0, t0, t1, args=None, **options) -> Any:

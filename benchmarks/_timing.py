@@ -129,3 +129,9 @@ def fastest(curves, target, group, by=1):
         if kind == group
     )
     return min((x for x in found if x[0] < math.inf), default=(math.inf, "-"))
+
+
+def ratios(curves, targets, group, ours):
+    """The least times of a group over those of `ours`; infinite if not reached."""
+    pairs = [[fastest(curves, x, g)[0] for g in (group, ours)] for x in targets]
+    return [a / b if b < math.inf else math.inf for a, b in pairs]
