@@ -20,6 +20,9 @@ from ._multipliers import find_root, Multipliers
 from ._split import AbstractSplit
 
 
+_ORDER = 2  # of a stage, and so of all that it consists of
+
+
 def _free(system: System) -> System:
     """The system without constraints."""
     return eqx.tree_at(lambda x: x.term, system, system.term.system)
@@ -42,7 +45,7 @@ class ConstrainedSplit(AbstractSplit):
     def prepare(self, system, t, h, order) -> PyTree:
         free, h = _free(system), lengths(order, h)
         starts = t + jnp.cumsum(h) - h
-        prepare = jax.vmap(lambda t, h: self.base.prepare(free, t, h, order))
+        prepare = jax.vmap(lambda t, h: self.base.prepare(free, t, h, _ORDER))
         back = prepare(starts + h, -h) if system.term.check_inverse else None
         return h, prepare(starts, h), back
 
@@ -99,13 +102,13 @@ class ConstrainedSplit(AbstractSplit):
     def kick(self, system, t, h, y, force, order) -> State:
         if self.base.kick_by == "force":
             return self.base.kick(_free(system), t, h, y, force, order)
-        stage = lambda y, h: (self._kick_stage(system, t, h, y, force, order), None)
+        stage = lambda y, h: (self._kick_stage(system, t, h, y, force), None)
         return lax.scan(stage, y, lengths(order, h))[0]
 
-    def _kick_stage(self, system, t, h, y, force, order) -> State:
+    def _kick_stage(self, system, t, h, y, force) -> State:
         """A kick with friction: two halves, and the multipliers between them."""
         term, free, args = system.term, _free(system), system.args
-        half = lambda y: self.base.kick(free, t, h / 2, y, force, order)
+        half = lambda y: self.base.kick(free, t, h / 2, y, force, _ORDER)
         middle, (q, p) = half(y), tree.values(y)
         normal = term.normal(t, q, args)
 

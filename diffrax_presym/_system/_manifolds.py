@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Inexact
+from jaxtyping import Array, ArrayLike, Float, Inexact
 
 from .._checks import as_positive
 from .._numbers import cast_to
@@ -57,7 +57,7 @@ class Euclidean(AbstractManifold):
     is_exact: ClassVar[bool] = True
     is_free: ClassVar[bool] = True
 
-    def __init__(self, mass=1.0):
+    def __init__(self, mass: ArrayLike = 1.0):
         """**Arguments:**
 
         - `mass`: a number, or an array with as many dimensions as `p` that broadcasts
