@@ -10,8 +10,12 @@ solve with `jax.jit` and without.
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 # pyright: reportOptionalSubscript=false
 
+import os
 import statistics
 import time
+
+
+os.environ["JAX_ENABLE_X64"] = "true"  # before galax makes its constants
 
 import diffrax as dfx
 import galax.coordinates as gc
@@ -23,9 +27,6 @@ import unxt as u
 from galax.dynamics.fields import AbstractOrbitField, HamiltonianField
 
 import diffrax_presym as dps
-
-
-jax.config.update("jax_enable_x64", True)
 
 
 @AbstractOrbitField.terms.dispatch
