@@ -75,12 +75,17 @@ _MOST = 128  # iterations
 def _iterate(equation: _Equation, guess: PyTree) -> tuple[PyTree, Bool[Array, ""]]:
     """Fixed-point iteration to rounding: kicks are so short that it takes a few."""
     first = jnp.full_like(tree.largest(guess), _ROUNDING)
-    end = lambda change: tree.add(equation.p, change)
+
+    def ends(change):
+        # A momentum that changes its sign may be far smaller at one of its ends than
+        # the rounding errors of its change.
+        new = tree.add(equation.p, change)
+        return jtu.tree_map(lambda *x: jnp.stack(x), equation.p, new)
 
     def iterate(state):
         found, moved, _, count = state
         new = tree.add(found, equation.residual(found))
-        change = largest_change(end(new), end(found), first.dtype)
+        change = largest_change(ends(new), ends(found), first.dtype)
         return new, change, moved, count + 1
 
     def converged(state) -> Bool[Array, ""]:
