@@ -295,8 +295,8 @@ MUTANTS = [
     Mutant(
         "a row of variable steps is found in the step before",
         "_loop/_variable.py",
-        "found = stops.at[j].set(n), insides.at[j].set(inside)",
-        "found = stops.at[j].set(n - 1), insides.at[j].set(inside)",
+        "value = (n, inside), self.value(j, n, inside, point)",
+        "value = (n - 1, inside), self.value(j, n, inside, point)",
         tests="test_step_density.py",
     ),
     Mutant(
@@ -467,8 +467,8 @@ MUTANTS = [
     Mutant(
         "Nystrom splittings take friction by place",
         "_system/_mechanical.py",
-        'KineticSplit(frozenset({"any"}))',
-        'KineticSplit(frozenset({"any", "nystrom"}))',
+        'KineticSplit(frozenset({"any"}), "friction")',
+        'KineticSplit(frozenset({"any", "nystrom"}), "friction")',
     ),
 ]
 

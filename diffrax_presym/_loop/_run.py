@@ -57,7 +57,9 @@ def run(problem: Problem, kept: AbstractTrack | None = None):
     for a gradient."""
     number, keep = len(problem.rows), kept is not None
     tracks = [_tracks(problem, i, keep) for i in range(number)]
-    progress, (stacked, kept_states) = _run_steps(problem, (tracks, kept))
+    progress, n, (stacked, kept_states) = _run_steps(problem, (tracks, kept))
+    trace_n = progress.n
+    progress = eqx.tree_at(lambda x: x.n, progress, n)
 
     saved, between, finite = [], [], tree.all_finite(progress.point[0])
     all_rows = []
@@ -89,7 +91,7 @@ def run(problem: Problem, kept: AbstractTrack | None = None):
     short = (result == success) & ~ended
     result = dfx.RESULTS.where(short, dfx.RESULTS.max_steps_reached, result)
     before = progress.before
-    trace = Trace(progress.n, progress.point, between, kept_states, before, all_rows)
+    trace = Trace(trace_n, progress.point, between, kept_states, before, all_rows)
     return (progress, result, saved), trace
 
 
@@ -122,8 +124,10 @@ def _tracks(
     return at_steps, Interpolated(stencils, kinks, functions.node, value, y, init)
 
 
-def _run_steps(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
-    """All steps, stopping where a value of a track is due."""
+def _run_steps(problem: Problem, tracks: PyTree) -> tuple[Progress, Array, PyTree]:
+    """All steps, stopping where a value of a track is due, until none of a batch is
+    left; the number of steps until each ended or was not finite; and what the tracks
+    collected."""
     steps, last, meter = problem.steps, problem.last, problem.progress_meter
     may_be_cut = not steps.are_known and tracks[1] is not None
 
@@ -162,20 +166,27 @@ def _run_steps(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
     ]
 
     def stop(x):
-        progress, states = x
+        progress, states, reached, going = x
         wanted = due(states)
         first, new = steps.next_stop(wanted, last), []
         progress = advance_to(first, progress)
         n, point = steps.number(first, progress.n), progress.point
         for track, state, next_stop in zip(flat, states, wanted, strict=True):
-            visit = lambda track=track, state=state: track.visit(state, n, point)
             here = steps.at(next_stop, n, point)
-            new.append(lax.cond(here, visit, lambda state=state: state))
-        return progress, new
+            # The same for all members of a batch: JAX would otherwise copy all that was
+            # collected. Of known steps they all are here.
+            some, alike = tree.any_member(here & going), here & going
+            if steps.are_known:
+                some, alike = here, True
+            visit = lambda track=track, state=state, alike=alike: track.visit(
+                state, n, point, alike
+            )
+            new.append(lax.cond(some, visit, lambda state=state: state))
+        reached = jnp.where(going, progress.n, reached)
+        return progress, new, reached, proceeds(progress, new)
 
-    def more(x):
-        (progress, states), end = x, Stop(last)
-        n, point = progress.n, progress.point
+    def proceeds(progress: Progress, states: list[PyTree]) -> Bool[Array, ""]:
+        n, point, end = progress.n, progress.point, Stop(last)
         first = steps.next_stop(due(states), jnp.asarray(MOST_STEPS, last.dtype))
         some = unfinished(progress, end)
         some |= steps.is_left(first, last, n, point) & good(progress)
@@ -184,11 +195,14 @@ def _run_steps(problem: Problem, tracks: PyTree) -> tuple[Progress, PyTree]:
 
     states = [track.start() for track in flat]
     if not flat:
-        return advance_to(Stop(last), start), jtu.tree_unflatten(structure, [])
+        end = advance_to(Stop(last), start)
+        return end, end.n, jtu.tree_unflatten(structure, [])
     # The end is a stop too, so that there is one loop over steps.
-    end, states = lax.while_loop(more, stop, (start, states))
+    first = start, states, zero, proceeds(start, states)
+    more = lambda x: tree.any_member(x[-1])
+    end, states, n, _ = lax.while_loop(more, stop, first)
     rows = [track.rows(state) for track, state in zip(flat, states, strict=True)]
-    return end, jtu.tree_unflatten(structure, rows)
+    return end, n, jtu.tree_unflatten(structure, rows)
 
 
 _is_none = lambda x: x is None

@@ -32,8 +32,9 @@ class AbstractTrack(eqx.Module):
         """Where a state is wanted next."""
 
     @abc.abstractmethod
-    def visit(self, state: PyTree, n: Array, point: Point) -> PyTree:
-        """The state after that, at the start of step `n`."""
+    def visit(self, state: PyTree, n: Array, point: Point, here: Any) -> PyTree:
+        """The state after that, at the start of step `n`, for those members of a batch
+        that are `here`, or `True`."""
 
     @abc.abstractmethod
     def rows(self, state: PyTree) -> PyTree:
@@ -57,9 +58,9 @@ class Track(AbstractTrack):
     def due(self, state):
         return Stop(self.stops[state[0]])
 
-    def visit(self, state, n, point):
+    def visit(self, state, n, point, here):
         j, rows = state
-        return j + 1, put(rows, j, self.value(j, point))
+        return j + here, put(rows, j, self.value(j, point), here)
 
     def rows(self, state):
         return state[1]
@@ -85,7 +86,8 @@ class Interpolated(AbstractTrack):
         n, j, *_ = state
         return Stop(jnp.maximum(n, self.stencils.first[j]))
 
-    def visit(self, state, n, point):
+    def visit(self, state, n, point, here):
+        assert here is True  # Steps are known.
         _, j, ring, rows, finite = state
         kink = jnp.zeros((), int)
         if self.kinks is not None:

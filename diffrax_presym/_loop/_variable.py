@@ -157,11 +157,11 @@ class Timed(AbstractTrack):
         left = j < len(self.times)
         return Stop(jnp.asarray(MOST_STEPS), jnp.where(left, t, jnp.inf))
 
-    def visit(self, state, n, point):
-        j, (stops, insides), rows = state
+    def visit(self, state, n, point, here):
+        j, found, rows = state
         inside = self.times[j] > point[1][1].t
-        found = stops.at[j].set(n), insides.at[j].set(inside)
-        return j + 1, found, put(rows, j, self.value(j, n, inside, point))
+        value = (n, inside), self.value(j, n, inside, point)
+        return j + here, *put((found, rows), j, value, here)
 
     def rows(self, state):
         return state[1:]
@@ -181,15 +181,15 @@ class Kept(AbstractTrack):
         count, every, _ = state
         return Stop(count * every)
 
-    def visit(self, state, n, point):
+    def visit(self, state, n, point, here):
         count, every, rows = state
-        full = count == self.most
+        full = (count == self.most) & here
         half = (self.most + 1) // 2
         # Every other one is dropped.
         fewer = lambda x: jnp.concatenate([x[::2], x[half:]])[: self.most]
         rows = lax.cond(full, lambda: jtu.tree_map(fewer, rows), lambda: rows)
         count, every = jnp.where(full, half, count), jnp.where(full, 2 * every, every)
-        here = count * every == n  # Not if an odd number was full.
+        here &= count * every == n  # Not if an odd number was full.
         rows = put(rows, jnp.minimum(count, self.most - 1), point, here)
         return jnp.where(here, count + 1, count), every, rows
 
