@@ -231,3 +231,50 @@ def test_second_derivatives():
     assert got == pytest.approx(
         float(slope(0.1 + h) - slope(0.1 - h)) / (2 * h), rel=1e-6
     )
+
+
+def _selected(jaxpr):
+    """The shapes of what is selected anywhere in a program."""
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "select_n":
+            yield from (x.aval.shape for x in equation.outvars)
+        for part in jax.tree.leaves(
+            equation.params, is_leaf=lambda x: hasattr(x, "eqns")
+        ):
+            part = getattr(part, "jaxpr", part)
+            if hasattr(part, "eqns"):
+                yield from _selected(part)
+
+
+QUARTIC = dps.MechanicalSystem(
+    dps.QuadraticKinetic(), lambda t, q, args: jnp.sum(q**4) / 4
+)
+VARIABLE = dps.StepDensityController(0.1, QUARTIC)
+
+
+@pytest.mark.parametrize(
+    "controller, dt0", [(dfx.ConstantStepSize(), 0.1), (VARIABLE, None)]
+)
+def test_a_batch_copies_nothing_that_was_saved(controller, dt0):
+    members, number = 5, 37
+
+    def saved(p):
+        ys = dfx.diffeqsolve(
+            *(QUARTIC, dps.BlanesMoanRKN4(), 0.0, 3.0, dt0, (jnp.ones(2), p)),
+            saveat=dfx.SaveAt(ts=jnp.linspace(0.1, 2.9, number)),
+            stepsize_controller=controller,
+            adjoint=dps.FixedStepAdjoint(),
+            max_steps=None,
+            throw=False,
+        ).ys
+        assert ys is not None
+        return ys[0]
+
+    start = jnp.arange(2.0 * members).reshape(members, 2) / 4
+    program = jax.make_jaxpr(jax.vmap(saved))(start)
+    shapes = list(_selected(program.jaxpr))
+    assert len(shapes) > 10
+    # After the loop rows that were not reached are filled, once.
+    assert shapes.count((members, number, 2)) <= 4
+    one_by_one = jnp.stack([saved(p) for p in start])
+    np.testing.assert_allclose(jax.vmap(saved)(start), one_by_one, rtol=1e-12)

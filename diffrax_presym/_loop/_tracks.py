@@ -60,7 +60,7 @@ class Track(AbstractTrack):
 
     def visit(self, state, n, point, here):
         j, rows = state
-        return j + here, put(rows, j, self.value(j, point), here)
+        return j + jnp.asarray(here, j.dtype), put(rows, j, self.value(j, point), here)
 
     def rows(self, state):
         return state[1]

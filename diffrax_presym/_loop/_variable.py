@@ -161,7 +161,7 @@ class Timed(AbstractTrack):
         j, found, rows = state
         inside = self.times[j] > point[1][1].t
         value = (n, inside), self.value(j, n, inside, point)
-        return j + here, *put((found, rows), j, value, here)
+        return j + jnp.asarray(here, j.dtype), *put((found, rows), j, value, here)
 
     def rows(self, state):
         return state[1:]
