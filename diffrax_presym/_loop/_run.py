@@ -57,9 +57,8 @@ def run(problem: Problem, kept: AbstractTrack | None = None):
     for a gradient."""
     number, keep = len(problem.rows), kept is not None
     tracks = [_tracks(problem, i, keep) for i in range(number)]
-    progress, n, (stacked, kept_states) = _run_steps(problem, (tracks, kept))
-    trace_n = progress.n
-    progress = eqx.tree_at(lambda x: x.n, progress, n)
+    end, n, (stacked, kept_states) = _run_steps(problem, (tracks, kept))
+    progress = eqx.tree_at(lambda x: x.n, end, n)
 
     saved, between, finite = [], [], tree.all_finite(progress.point[0])
     all_rows = []
@@ -90,8 +89,7 @@ def run(problem: Problem, kept: AbstractTrack | None = None):
     ended = problem.steps.ended(progress.n, progress.point)
     short = (result == success) & ~ended
     result = dfx.RESULTS.where(short, dfx.RESULTS.max_steps_reached, result)
-    before = progress.before
-    trace = Trace(trace_n, progress.point, between, kept_states, before, all_rows)
+    trace = Trace(end.n, end.point, between, kept_states, end.before, all_rows)
     return (progress, result, saved), trace
 
 

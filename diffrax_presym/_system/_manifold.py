@@ -169,8 +169,16 @@ class ManifoldSystem(AbstractSystem):
 
     # The vector field.
 
+    def _along_axes(self, p: P) -> P:
+        """The velocities that momenta have, of bodies along their axes."""
+        return divide(self.mechanics.mass, p, MASS, "p")
+
+    def _tangential(self, q: Q, force: P) -> P:
+        """The part along the manifold of forces on the momenta."""
+        return self.map(lambda m, q, x: m.project(q, x)[1], q, force)
+
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
-        v = divide(self.mechanics.mass, p, MASS, "p")
+        v = self._along_axes(p)
         with jax.numpy_dtype_promotion("standard"):
             return tree.dot(p, v) / 2 + self.potential(t, q, args)
 
@@ -197,9 +205,9 @@ class ManifoldSystem(AbstractSystem):
         """As of any system, of velocities that are along the axes of bodies."""
         if external is None and not any(self.parts[1:]):
             return force
-        v = divide(self.mechanics.mass, p, MASS, "p")
-        other = super().add_forces(tree.zeros(p), external, t, q, p, v, args)
-        return tree.add(force, self.map(lambda m, q, x: m.project(q, x)[1], q, other))
+        state = t, q, p, self._along_axes(p), args
+        other = super().add_forces(tree.zeros(p), external, *state)
+        return tree.add(force, self._tangential(q, other))
 
     def to_momentum(self, q: Q, force: Q) -> P:
         """The rate of change of the momenta by a force in ambient coordinates."""
@@ -210,7 +218,7 @@ class ManifoldSystem(AbstractSystem):
         if not isinstance(self.potential, ForceField):
             return self.to_momentum(q, self.potential.force(t, q, args))
         force = match(self.potential.fn(t, q, args), p, "`force`", "`p`")
-        return self.map(lambda m, q, x: m.project(q, x)[1], q, force)
+        return self._tangential(q, force)
 
 
 class ManifoldSplit(AbstractForceSplit):
