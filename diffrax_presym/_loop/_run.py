@@ -171,11 +171,12 @@ def _run_steps(problem: Problem, tracks: PyTree) -> tuple[Progress, Array, PyTre
         n, point = steps.number(first, progress.n), progress.point
         for track, state, next_stop in zip(flat, states, wanted, strict=True):
             here = steps.at(next_stop, n, point)
-            # The same for all members of a batch: JAX would otherwise copy all that was
-            # collected. Of known steps they all are here.
-            some, alike = tree.any_member(here & going), here & going
-            if steps.are_known:
-                some, alike = here, True
+            # Members of a batch that take the same steps are here together. The others
+            # are visited together, as JAX would otherwise copy all that was collected.
+            some, alike = here, True
+            if not steps.are_known:
+                alike = here & going
+                some = tree.any_member(alike)
             visit = lambda track=track, state=state, alike=alike: track.visit(
                 state, n, point, alike
             )
