@@ -8,7 +8,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 from .. import _tree as tree
 from .._checks import check_callable, describe, match
@@ -191,11 +191,7 @@ class ManifoldSystem(AbstractSystem):
     def velocity_and_force(
         self, t: Time, q: Q, p: P, args: PyTree = None
     ) -> tuple[Q, P]:
-        def free(m: AbstractManifold, q: Array, p: Array) -> tuple[Array, Array]:
-            zero, one = jnp.zeros((), p.dtype), jnp.ones((), p.dtype)
-            return jax.jvp(lambda s: m.flow(q, p, s), (zero,), (one,))[1]
-
-        velocity, force = self.pair(self.map(free, q, p))
+        velocity, force = self.pair(self._each("rates", q, p))
         force = tree.add(force, self.kick(t, q, p, args))
         return velocity, self.add_forces(force, self.external, t, q, p, velocity, args)
 

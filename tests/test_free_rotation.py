@@ -1,0 +1,117 @@
+"""The free rotation of a rigid body, beside Euler's equations in NumPy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+
+import diffrax_presym as dps
+
+
+UNIT = np.array([1.0, -0.2, 0.5, 0.3]) / np.linalg.norm([1.0, -0.2, 0.5, 0.3])
+# Principal moments, and the angular momentum.
+BODIES = {
+    "asymmetric": ([1.0, 1.6, 2.3], [0.7, -0.4, 1.1]),
+    "middle moment first": ([1.6, 2.3, 1.0], [0.7, -0.4, 1.1]),
+    "middle moment last": ([2.3, 1.0, 1.6], [0.7, -0.4, 1.1]),
+    "reversed order": ([2.3, 1.6, 1.0], [0.7, -0.4, 1.1]),
+    "about the least moment": ([1.0, 1.6, 2.3], [1.3, 0.2, 0.1]),
+    "about the middle moment": ([1.0, 1.6, 2.3], [0.0, 1.5, 0.0]),
+    "about the largest moment": ([1.0, 1.6, 2.3], [0.0, 0.0, -1.5]),
+    "on the separatrix": ([1.0, 1.5, 3.0], [1.0, 0.1, 1.0]),
+    "near the separatrix": ([1.0, 1.5, 3.0], [1.0, 0.1, 1.0 + 1e-9]),
+    "symmetric, flat": ([1.0, 1.0, 1.9], [0.7, -0.4, 1.1]),
+    "symmetric, long": ([1.0, 0.1, 1.0], [0.7, -0.04, 0.2]),
+    "nearly symmetric": ([1.0, 1.0 + 1e-12, 1.9], [0.7, -0.4, 1.1]),
+    "spherical": ([0.8, 0.8, 0.8], [0.7, -0.4, 1.1]),
+    "nearly at rest": ([1.0, 1.6, 2.3], [1e-7, -2e-7, 1e-7]),
+    "at rest": ([1.0, 1.6, 2.3], [0.0, 0.0, 0.0]),
+}
+TIMES = 1e-6, 1e-3, 0.1, 1.0, -0.8
+
+
+def euler(inertia, p, s):
+    def field(t, y):
+        q, p = y[:4], y[4:]
+        w = p / inertia
+        real = -np.dot(q[1:], w)
+        imaginary = q[0] * w + np.cross(q[1:], w)
+        return np.concatenate([[real / 2], imaginary / 2, np.cross(p, w)])
+
+    return scipy.integrate.solve_ivp(
+        *(field, (0.0, s), np.concatenate([UNIT, p]), "DOP853"), rtol=1e-13, atol=1e-15
+    ).y[:, -1]
+
+
+@jax.jit
+def flow(inertia, y, s):
+    q, p = dps.Attitude(inertia).flow(y[:4], y[4:], s)
+    return jnp.concatenate([q, p])
+
+
+def state(p):
+    return jnp.concatenate([jnp.asarray(UNIT), jnp.asarray(p)])
+
+
+DERIVATIVES = [
+    jax.jit(jacobian(lambda p, inertia, s: flow(inertia, state(p), s), (0, 1, 2)))
+    for jacobian in (jax.jacfwd, jax.jacrev)
+]
+
+
+@pytest.mark.parametrize("s", TIMES)
+@pytest.mark.parametrize("body", BODIES)
+def test_beside_eulers_equations(body, s):
+    inertia, p = map(np.array, BODIES[body])
+    found = flow(inertia, state(p), s)
+    np.testing.assert_allclose(found, euler(inertia, p, s), atol=3e-14)
+    # The way back is exact, and so is a way in two parts.
+    np.testing.assert_allclose(flow(inertia, found, -s), state(p), atol=1e-14)
+    parts = flow(inertia, flow(inertia, state(p), 0.3 * s), 0.7 * s)
+    np.testing.assert_allclose(parts, found, atol=1e-14)
+
+
+@pytest.mark.parametrize("s", [1e-3, 0.1, 1.0])
+@pytest.mark.parametrize("body", BODIES)
+def test_derivatives(body, s):
+    inertia, p = map(np.array, BODIES[body])
+
+    def difference(fn, x, i):
+        step = 1e-4 * np.eye(len(x))[i]
+        near = (fn(x + step) - fn(x - step)) / (2e-4)
+        far = (fn(x + 2 * step) - fn(x - 2 * step)) / (4e-4)
+        return (4 * near - far) / 3
+
+    # The period is infinite there, and the functions depend on a root of the distance.
+    atol = 1e-3 if body == "on the separatrix" else 1e-8
+    by_p = lambda p: flow(inertia, state(p), s)
+    by_inertia = lambda inertia: flow(inertia, state(p), s)
+    for fn, x, which in ((by_p, p, 0), (by_inertia, inertia, 1)):
+        exact = np.stack([difference(fn, jnp.asarray(x), i) for i in range(3)], axis=1)
+        for derivatives in DERIVATIVES:
+            found = derivatives(jnp.asarray(p), jnp.asarray(inertia), s)[which]
+            np.testing.assert_allclose(found, exact, atol=atol)
+    by_time = DERIVATIVES[0](jnp.asarray(p), jnp.asarray(inertia), s)[2]
+    q, p = (flow(inertia, state(p), s)[i:j] for i, j in ((0, 4), (4, 7)))
+    body = dps.Attitude(inertia)
+    np.testing.assert_allclose(by_time[:4], body.velocity(q, p), atol=1e-11)
+    np.testing.assert_allclose(by_time[4:], jnp.cross(p, p / inertia), atol=1e-11)
+
+
+@pytest.mark.parametrize("s", [40.0, 1000.0])
+def test_momentum_after_many_periods(s):
+    inertia, p = map(np.array, BODIES["asymmetric"])
+    found = flow(inertia, state(p), s)[4:]
+    np.testing.assert_allclose(found, euler(inertia, p, s)[4:], atol=1e-13 * (10 + s))
+
+
+def test_many_bodies_in_single_precision():
+    rng = np.random.default_rng(0)
+    single = lambda x: np.asarray(x, np.float32)
+    inertia = single(rng.uniform(0.5, 2.0, (50, 3)))
+    p, q = single(rng.standard_normal((50, 3))), jnp.asarray(single([UNIT] * 50))
+    found = dps.Attitude(inertia).flow(q, jnp.asarray(p), jnp.float32(0.2))
+    exact = np.stack([euler(*x, 0.2) for x in zip(inertia, p, strict=True)])
+    assert found[0].dtype == found[1].dtype == jnp.float32
+    np.testing.assert_allclose(np.concatenate(found, axis=1), exact, atol=2e-6)
