@@ -15,7 +15,17 @@ from .._interpolation import HermiteInterpolation, inner_points
 from .._numbers import cast_to, State
 from .._results import NONFINITE
 from .._system._bound import bind, System, unwrap
-from ._engine import first_failure, forward, Moves, prepare, Result, Span
+from ._engine import (
+    AbstractMove,
+    first_failure,
+    forward,
+    inverse,
+    Moves,
+    MoveSequence,
+    prepare,
+    Result,
+    Span,
+)
 from ._failure import explain, unless_too_strong
 from ._strong_friction import Pattern
 
@@ -29,7 +39,9 @@ Point = tuple[State, PyTree]  # a state and the solver state
 class Scheme(NamedTuple):
     """What a solver does with a system."""
 
-    moves: Moves
+    # Between the ends of a step, where `ends` changes the variables, and back.
+    inner: Moves
+    ends: AbstractMove | None = None
     # The initial solver state, of the system, a time and a state.
     start: Callable[[System, Array, State], PyTree] = lambda system, t, y: None
     # From the solver state the force that ends a step, if it is known.
@@ -52,6 +64,14 @@ class Scheme(NamedTuple):
     failure: Any = NONFINITE  # the reason if a state is not finite
     # The maps that it consists of, if these are known.
     pattern: Pattern = ()
+
+    @property
+    def moves(self) -> Moves:
+        """All moves of a step."""
+        if self.ends is None:
+            return self.inner
+        moves = self.ends, self.inner, inverse(self.ends)
+        return MoveSequence(moves, [(0, 0, 0), (0, 1, 1), (1, 1, 0)])
 
 
 class AbstractPresymplecticSolver(dfx.AbstractSolver):

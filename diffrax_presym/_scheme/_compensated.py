@@ -6,7 +6,6 @@ from .._numbers import State
 from .._system._base import AbstractSystem
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, check_base, Scheme
-from ._engine import inverse, MoveSequence
 from ._moves import ToSums
 
 
@@ -72,8 +71,7 @@ class Compensated(AbstractPresymplecticSolver):
                 f"`Compensated` sums states, but this `{system.name}` updates them by "
                 "an `add` of its own. Use the scheme without it."
             )
-        base, enter = self.base.scheme(system), ToSums()
-        moves = enter, base.moves, inverse(enter)
+        base = self.base.scheme(system)
 
         def start(system: System, t: Array, y: State) -> PyTree:
             lost = tree.zeros(y)
@@ -82,7 +80,8 @@ class Compensated(AbstractPresymplecticSolver):
         inner = base.check
         check = inner and (lambda system, t, y, x: inner(system, t, y, x[0]))
         return base._replace(
-            moves=MoveSequence(moves, [(0, 0, 0), (0, 1, 1), (1, 1, 0)]),
+            inner=base.moves,
+            ends=ToSums(),
             start=start,
             end_force=lambda carry: base.end_force(carry[0]),
             check=check,

@@ -83,7 +83,7 @@ class Composition(AbstractPresymplecticSolver):
         if most == math.inf:
             most = friction_limit(system, pattern, self.order(None))
         return scheme._replace(
-            moves=MoveSequence([scheme.moves], substeps(self.weights)),
+            inner=MoveSequence([scheme.inner], substeps(self.weights)),
             most_friction=most,
             pattern=pattern,
         )

@@ -13,17 +13,19 @@ from ._engine import AbstractMove, Outcome, Span, StepState
 
 
 class Enter(AbstractMove):
-    """From `(q, p)` to the variables of the shared split; the inverse goes back."""
+    """From `(q, p)` to the variables of a split; the inverse goes back."""
+
+    kind: str = eqx.field(static=True)
 
     def apply(
         self, system: System, span: Span, data: None, stage: StepState
     ) -> Outcome:
         y, carry = stage
-        return (system.split("shared").enter(system, span.t0, y), carry), None
+        return (system.split(self.kind).enter(system, span.t0, y), carry), None
 
     def undo(self, system: System, span: Span, data: None, stage: StepState) -> Outcome:
         y, carry = stage
-        return (system.split("shared").leave(system, span.t0, y), carry), None
+        return (system.split(self.kind).leave(system, span.t0, y), carry), None
 
 
 class Drift(AbstractMove):

@@ -9,6 +9,7 @@ from jaxtyping import Array, PyTree
 from .._compositions import substeps
 from .._numbers import State
 from .._system._bound import System
+from .._system._split import AbstractSplit
 from ._base import AbstractPresymplecticSolver, Scheme
 from ._engine import inverse, Moves, MoveSequence
 from ._find_split import find_split
@@ -68,12 +69,10 @@ class AbstractSplitting(AbstractPresymplecticSolver):
             start = Kick(kind, order, known=True)
             moves = [start, *moves, inverse(start)]
             spans = [(0, 0, kicks[0]), *spans, (1, 1, kicks[-1])]
-        if kind == "linear":
-            enter = Enter()
-            moves = [enter, *moves, inverse(enter)]
-            spans = [(0, 0, 0), *spans, (1, 1, 0)]
+        changes = type(split).leave is not AbstractSplit.leave
         scheme = Scheme(
             MoveSequence(moves, spans),
+            Enter(kind) if changes else None,
             # Interpolated values would be off the manifold.
             is_resolved=kind != "linear" and not system.term.is_constrained,
             most_friction=most,
@@ -92,7 +91,7 @@ class AbstractSplitting(AbstractPresymplecticSolver):
 def first_force(system: System, kind: str, t: Array, y: State) -> PyTree:
     """The force with which a scheme that starts with a kick starts."""
     split = system.split(kind)
-    return split.force(system, t, split.enter(system, t, y) if kind == "linear" else y)
+    return split.force(system, t, split.enter(system, t, y))
 
 
 class Splitting(AbstractSplitting):

@@ -140,7 +140,7 @@ class ConstrainedSystem(AbstractSystem):
     def splits(self) -> tuple[AbstractSplit, ...]:
         (split, *_) = self.system.splits
         assert isinstance(split, AbstractForceSplit)
-        return (ConstrainedSplit(split),)
+        return (ConstrainedSplit(split, self.check_inverse),)
 
     def value(self, t: Time, q: Q, args: PyTree) -> Multipliers:
         """The constraints, as a vector."""
@@ -174,9 +174,9 @@ class ConstrainedSystem(AbstractSystem):
         normal = self.normal(t, q, args)
         return lambda x: self.rate(t, q, normal(x), args, flow=0.0)
 
-    def to_tangent(self, t: Time, q: Q, p: P, args: PyTree, flow: float = 1.0) -> P:
+    def to_tangent(self, t: Time, q: Q, p: P, args: PyTree) -> P:
         """The change of a momentum that makes it tangential."""
-        return self._reaction(t, q, self.rate(t, q, p, args, flow), args)
+        return self._reaction(t, q, self.rate(t, q, p, args), args)
 
     def _reaction(self, t: Time, q: Q, miss: Multipliers, args: PyTree) -> P:
         linear = self._matrix(t, q, args)

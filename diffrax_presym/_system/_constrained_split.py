@@ -12,7 +12,7 @@ from jaxtyping import Array, PyTree
 
 from .. import _tree as tree
 from .._compositions import lengths
-from .._numbers import State
+from .._numbers import State, Time
 from .._results import CONSTRAINT_NOT_SOLVED, NOT_REVERSIBLE, SUCCESSFUL
 from ._bound import System
 from ._force_split import AbstractForceSplit
@@ -32,21 +32,31 @@ class ConstrainedSplit(AbstractSplit):
     """The drift and the kick of a split, both on the constraint.
 
     A drift starts with a momentum along the normals, so that it ends on the constraint.
-    It is symmetric, of second order, and composed to the order that is needed.
+    It is symmetric, of second order, and composed to the order that is needed. Momenta
+    along the normals do not change where it ends, so they are projected at the end of a
+    step alone, unless a kick depends on the momentum, or a drift is also inverted.
     """
 
     base: AbstractForceSplit
+    check_inverse: bool = eqx.field(static=True)
     kinds: ClassVar[frozenset[str]] = frozenset({"any"})
 
     @property
     def failure(self):
         return self.base.failure
 
+    def leave(self, system, t, y) -> State:
+        return self._tangential(system, t, y) if self.base.kick_by == "force" else y
+
+    def _tangential(self, system: System, t: Time, y: State) -> State:
+        change = system.term.to_tangent(t, *tree.values(y), system.args)
+        return system.add(y, (None, change))
+
     def prepare(self, system, t, h, order) -> PyTree:
         free, h = _free(system), lengths(order, h)
         starts = t + jnp.cumsum(h) - h
         prepare = jax.vmap(lambda t, h: self.base.prepare(free, t, h, _ORDER))
-        back = prepare(starts + h, -h) if system.term.check_inverse else None
+        back = prepare(starts + h, -h) if self.check_inverse else None
         return h, prepare(starts, h), back
 
     def drift(self, system, t, h, data, y) -> State:
@@ -58,7 +68,7 @@ class ConstrainedSplit(AbstractSplit):
             start = tree.values(y[0])
             y, found = self._stage(system, t, h, data, y)
             failure = dfx.RESULTS.where(found, SUCCESSFUL, CONSTRAINT_NOT_SOLVED)
-            if system.term.check_inverse:
+            if self.check_inverse:
                 values = lax.stop_gradient(tree.values(y))
                 (end, _), found = self._stage(system, t + h, -h, back, values)
                 miss, unit = tree.largest(tree.sub(end, start)), tree.largest(end)
@@ -89,15 +99,12 @@ class ConstrainedSplit(AbstractSplit):
         miss = lambda x: term.value(t + h, tree.values(moved(x)[0]), args)
         x, found = find_root(miss, like, small, term.linear_solver)
         y = moved(x)
-        change = term.to_tangent(t + h, *tree.values(y), args)
-        return system.add(y, (None, change)), found
+        if self.base.kick_by != "force" or self.check_inverse:
+            y = self._tangential(system, t + h, y)
+        return y, found
 
     def force(self, system, t, y) -> PyTree:
-        force, (q, _) = self.base.force(_free(system), t, y), tree.values(y)
-        if self.base.kick_by != "force":
-            return force
-        change = system.term.to_tangent(t, q, force, system.args, flow=0.0)
-        return tree.add(force, change)
+        return self.base.force(_free(system), t, y)
 
     def kick(self, system, t, h, y, force, order) -> State:
         if self.base.kick_by == "force":

@@ -54,6 +54,15 @@ class AbstractSplit(eqx.Module):
 
     # What is different for some splits.
 
+    def enter(self, system: "System", t: Time, y: State) -> State:
+        """From `(q, p)`, at the start of a step, to the variables of the split. By
+        default these are the same."""
+        return y
+
+    def leave(self, system: "System", t: Time, y: State) -> State:
+        """Back to `(q, p)`, at the end of a step."""
+        return y
+
     def attempt(
         self, system: "System", t: Time, h: Time, data: PyTree, y: State
     ) -> tuple[State, dfx.RESULTS | None]:
