@@ -45,6 +45,10 @@ from ._step_size._choose import (
     ChosenStep as ChosenStep,
 )
 from ._step_size._density import StepDensityController as StepDensityController
+from ._system._attitude import (
+    Attitude as Attitude,
+    rotation_matrix as rotation_matrix,
+)
 from ._system._bregman import BregmanHamiltonian as BregmanHamiltonian
 from ._system._constrained import ConstrainedSystem as ConstrainedSystem
 from ._system._energy import Hamiltonian as Hamiltonian
@@ -55,9 +59,7 @@ from ._system._kinetic import (
 from ._system._lagrangian import LagrangianSystem as LagrangianSystem
 from ._system._manifold import ManifoldSystem as ManifoldSystem
 from ._system._manifolds import (
-    Attitude as Attitude,
     Euclidean as Euclidean,
-    rotation_matrix as rotation_matrix,
     Sphere as Sphere,
     Stiefel as Stiefel,
 )

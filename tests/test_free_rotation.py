@@ -83,15 +83,13 @@ def test_derivatives(body, s):
         far = (fn(x + 2 * step) - fn(x - 2 * step)) / (4e-4)
         return (4 * near - far) / 3
 
-    # The period is infinite there, and the functions depend on a root of the distance.
-    atol = 1e-3 if body == "on the separatrix" else 1e-8
     by_p = lambda p: flow(inertia, state(p), s)
     by_inertia = lambda inertia: flow(inertia, state(p), s)
     for fn, x, which in ((by_p, p, 0), (by_inertia, inertia, 1)):
         exact = np.stack([difference(fn, jnp.asarray(x), i) for i in range(3)], axis=1)
         for derivatives in DERIVATIVES:
             found = derivatives(jnp.asarray(p), jnp.asarray(inertia), s)[which]
-            np.testing.assert_allclose(found, exact, atol=atol)
+            np.testing.assert_allclose(found, exact, atol=1e-8)
     by_time = DERIVATIVES[0](jnp.asarray(p), jnp.asarray(inertia), s)[2]
     q, p = (flow(inertia, state(p), s)[i:j] for i, j in ((0, 4), (4, 7)))
     body = dps.Attitude(inertia)
@@ -99,8 +97,8 @@ def test_derivatives(body, s):
     np.testing.assert_allclose(by_time[4:], jnp.cross(p, p / inertia), atol=1e-11)
 
 
-@pytest.mark.parametrize("s", [40.0, 1000.0])
-def test_momentum_after_many_periods(s):
+@pytest.mark.parametrize("s", [10.0, 40.0])
+def test_momentum_after_periods(s):
     inertia, p = map(np.array, BODIES["asymmetric"])
     found = flow(inertia, state(p), s)[4:]
     np.testing.assert_allclose(found, euler(inertia, p, s)[4:], atol=1e-13 * (10 + s))

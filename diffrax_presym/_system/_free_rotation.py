@@ -1,4 +1,4 @@
-"""The angular momentum of a rigid body that rotates freely.
+"""The free rotation of rigid bodies.
 
 Euler's equations have Jacobi's elliptic functions as solutions. By their addition
 theorem the momentum after a time `s` is rational in that at the start and in
@@ -7,26 +7,66 @@ theorem the momentum after a time `s` is rational in that at the start and in
 
 which are smooth functions of `s` and of two squares: `S'^2 = (1 - α S^2)(1 - β S^2)`,
 `C^2 = 1 - α S^2` and `D^2 = 1 - β S^2`. So neither a phase nor a distinction of cases
-is needed.
+is needed. The attitude follows from the momentum at both ends, and from one angle.
 """
 
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Inexact
+import numpy as np
+from jaxtyping import Array, Bool, Inexact
+
+from .._numbers import cast_to
+from ._manifolds import inner, sinc
 
 
+Vectors = Inexact[Array, "... 3"]
+Quaternions = Inexact[Array, "... 4"]
 Three = tuple[Array, Array, Array]  # the entries along the principal axes
 
-# Of the arithmetic-geometric mean, which then has converged for any modulus.
-_LEVELS = 8
+# The functions are doubled so often. At a 64th of the time the series has converged.
+_DOUBLINGS = 6
+# Where the rate of the angle is known, in units of the step, and its end.
+_NODES, _WEIGHTS = (x / 2 for x in np.polynomial.legendre.leggauss(6))
+_TIMES = np.append(0.5 + _NODES, 1.0)
 
 
-def root(x: Array) -> Array:
-    """The square root, with a derivative where it is zero."""
-    return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1)), 0)
+def multiply(x: Quaternions, y: Quaternions) -> Quaternions:
+    a, b, u, v = x[..., :1], y[..., :1], x[..., 1:], y[..., 1:]
+    vector = a * v + b * u + jnp.cross(u, v)
+    return jnp.concatenate([a * b - inner(u, v), vector], axis=-1)
 
 
-def sinc(x: Array) -> Array:
-    return jnp.sinc(x / jnp.pi)
+def _turned_back(q: Quaternions, x: Vectors) -> Vectors:
+    """A vector, rotated by the inverse."""
+    a, u = q[..., :1], q[..., 1:]
+    moved = jnp.cross(x, u)
+    return x + 2 * (a * moved + jnp.cross(moved, u))
+
+
+# Along the axes separately, as XLA on a CPU computes what is stacked more than once.
+
+
+def _entries(x: Vectors) -> Three:
+    a, b, c = jnp.moveaxis(x, -1, 0)
+    return a, b, c
+
+
+def _each(fn: Callable, *vectors: Three) -> Three:
+    a, b, c = map(fn, *vectors)
+    return a, b, c
+
+
+def _dot(x: Three, y: Three) -> Array:
+    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
+
+
+def _cross(x: Three, y: Three) -> Three:
+    (a, b, c), (u, v, w) = x, y
+    return b * w - c * v, c * u - a * w, a * v - b * u
 
 
 def _turned(x: Three, first: Array, third: Array) -> Three:
@@ -36,46 +76,122 @@ def _turned(x: Three, first: Array, third: Array) -> Three:
     return choose(a, c, b), choose(b, a, c), choose(c, b, a)
 
 
-def _elliptic(s: Array, alpha: Array, beta: Array, difference: Array) -> Three:
-    """`S`, `C` and `D`, by the descending Landen transformation. The difference of the
-    squares is given without cancellation."""
-    swap = difference < 0
-    larger, gap = jnp.where(swap, beta, alpha), jnp.where(swap, -1, 1) * difference
-    # If they are equal the period is infinite, and the mean would be zero.
-    least = float(jnp.finfo(larger.dtype).eps) * larger
-    a, b = root(larger), root(gap + least)
-    products = []
-    for _ in range(_LEVELS):
-        a, b, half = (a + b) / 2, root(a * b), (a - b) / 2
-        products.append(a * half)
-    S, C, D = s * sinc(a * s), jnp.cos(a * s), jnp.ones_like(a * s)
-    for product in reversed(products):
-        x = product * S**2
-        S, C, D = S / (1 + x), C * D / (1 + x), (1 - x) / (1 + x)
-    return S, jnp.where(swap, D, C), jnp.where(swap, C, D)
+def _elliptic(s: Array, alpha: Array, beta: Array) -> Three:
+    """`S`, `1 - C` and `1 - D`, of which the last two are small."""
+    s, total, product = s / 2**_DOUBLINGS, alpha + beta, alpha * beta
+    z, square = total * s**2, product * s**4
+    series = 1 + z * (-1 / 6 + z * (1 / 120 + z * (-1 / 5040 + z / 362880)))
+    series += square * (1 / 10 + z * (-11 / 420 + z * 17 / 5040) + square / 120)
+    S = s * series
+    C, D = jnp.sqrt(1 - alpha * S**2), jnp.sqrt(1 - beta * S**2)
+    c, d = alpha * S**2 / (1 + C), beta * S**2 / (1 + D)
+    for _ in range(_DOUBLINGS):
+        twice = 2 * S / (1 - product * S**4)
+        C, D = 1 - c, 1 - d
+        S, c, d = twice * C * D, twice * S * D**2 * alpha, twice * S * C**2 * beta
+    return S, c, d
 
 
-def free_momentum(
-    p: Inexact[Array, "... 3"], rates: Inexact[Array, "... 3"], s: Array
-) -> Inexact[Array, "... 3"]:
-    """The angular momentum after a time `s`. `rates` are the inverses of the moments of
-    inertia."""
-    (u, v, w), (x, y, z) = jnp.moveaxis(rates, -1, 0), jnp.moveaxis(p, -1, 0)
+def _momentum(p: Three, rates: Three, s: Array) -> Three:
+    """The angular momentum after a time `s`."""
+    u, v, w = rates
     # The second axis is to be that of the middle moment.
     is_second = (v - u) * (v - w) <= 0
     is_first = ~is_second & ((u - v) * (u - w) <= 0)
     is_third = ~(is_second | is_first)
-    u, v, w = _turned((u, v, w), is_first, is_third)
-    x, y, z = _turned((x, y, z), is_first, is_third)
+    u, v, w = _turned(rates, is_first, is_third)
+    x, y, z = _turned(p, is_first, is_third)
     # Euler's equations: x' = a y z, y' = b z x, z' = c x y, with a c >= 0.
     a, b, c = w - v, u - w, v - u
     both = a * c * y**2
-    squares = both - a * b * z**2, both - b * c * x**2
-    S, C, D = _elliptic(s, *squares, b * (c * x**2 - a * z**2))
-    later = (
-        x * C + a * y * z * S * D,
-        y * C * D + b * z * x * S,
-        z * D + c * x * y * S * C,
+    S, C, D = _elliptic(s, both - a * b * z**2, both - b * c * x**2)
+    shift, scale = both * S**2, 1 / (1 - both * S**2)
+    change = (
+        (x * (shift - C) + a * y * z * S * (1 - D)) * scale,
+        (y * (shift - C - D + C * D) + b * z * x * S) * scale,
+        (z * (shift - D) + c * x * y * S * (1 - C)) * scale,
     )
-    later = _turned(later, is_third, is_first)
-    return jnp.stack(later, axis=-1) / (1 - both * S**2)[..., None]
+    return _each(jnp.add, p, _turned(change, is_third, is_first))
+
+
+def _is_small(p: Vectors, rates: Vectors, s: Array) -> Bool[Array, "..."]:
+    limit = float(jnp.finfo(p.dtype).eps) ** (2 / 3)
+    return jnp.sum(p**2, axis=-1) * (s * jnp.max(rates, axis=-1)) ** 2 <= limit
+
+
+def _rotation(p: Vectors, rates: Vectors, s: Array) -> tuple[Quaternions, Vectors]:
+    # The rotation takes the momentum at the end to that at the start: the shortest one
+    # does, and then one about it by an angle, which is an integral. A small one is that
+    # by the mean velocity, as neither is defined for a body at rest.
+    is_small = _is_small(p, rates, s)
+    start, each = _entries(p), _entries(rates)
+
+    def after(x: Array) -> tuple[Three, Array, Array]:
+        """The momentum, its product with both, and the rate of the angle."""
+        later = _momentum(start, each, x * s)
+        both = _each(jnp.add, start, later)
+        product = jnp.where(is_small, 1, _dot(start, both))
+        return later, product, _dot(both, _each(jnp.multiply, later, each)) / product
+
+    later, product, rate = jax.vmap(after)(cast_to(_TIMES, p))
+    end = _each(lambda x: x[-1], later)
+    mean = jnp.tensordot(cast_to(_WEIGHTS, p), rate[:-1], 1)
+
+    def about(a: Array, b: Array, w: Array) -> Array:
+        return s / 2 * jnp.where(is_small, (a + b) / 2 * w, a * mean)
+
+    half = _each(about, start, end, each)
+    angle = jnp.sqrt(_dot(half, half))
+    real, turn = jnp.cos(angle), _each(lambda x: x * sinc(angle), half)
+    cosine = jnp.where(is_small, 1, product[-1])
+    axis = _each(lambda x: jnp.where(is_small, 0, x), _cross(end, start))
+    scale = 1 / jnp.sqrt(cosine**2 + _dot(axis, axis))
+
+    def imaginary(a: Array, b: Array, c: Array) -> Array:
+        return scale * (real * a + cosine * b + c)
+
+    vector = _each(imaginary, axis, turn, _cross(turn, axis))
+    real = scale * (real * cosine - _dot(turn, axis))
+    return jnp.stack([real, *vector], axis=-1), jnp.stack(end, axis=-1)
+
+
+@eqx.filter_custom_jvp
+def free_rotation(p: Vectors, rates: Vectors, s: Array) -> tuple[Quaternions, Vectors]:
+    """The rotation of bodies over a time `s`, from their axes at the end to those at
+    the start, and the angular momenta along the axes at the end. `rates` are the
+    inverses of the moments of inertia."""
+    # Or XLA on a CPU computes it again for each use of an entry.
+    return lax.optimization_barrier(_rotation(p, rates, s))
+
+
+@free_rotation.def_jvp
+def _free_rotation_jvp(primals, tangents):
+    """From the derivative of the momentum alone. The angular momentum in space is that
+    at the start, and the derivative of the action is the change of the rotation along
+    the momentum."""
+    p, rates, s = primals
+    dp, drates, ds = (
+        jnp.zeros_like(x) if dx is None else dx
+        for x, dx in zip(primals, tangents, strict=True)
+    )
+    turn, end = free_rotation(p, rates, s)
+
+    def momentum(p: Vectors, rates: Vectors, s: Array) -> Vectors:
+        return jnp.stack(_momentum(_entries(p), _entries(rates), s), axis=-1)
+
+    _, dend = jax.jvp(momentum, primals, (dp, drates, ds))
+    work = s * p * rates * dp + ds * rates * end**2
+    if tangents[1] is not None:
+        nodes = jax.vmap(lambda x: momentum(p, rates, x * s))(cast_to(_TIMES[:-1], p))
+        mean = jnp.tensordot(cast_to(_WEIGHTS, p), nodes**2, 1)
+        work += s / 2 * (p**2 + mean) * drates
+    change = _turned_back(turn, dp) - dend
+    along = end * jnp.sum(work, axis=-1, keepdims=True)
+    is_small = _is_small(p, rates, s)[..., None]
+    square = jnp.where(is_small, 1, inner(p, p))
+    angle = s / 2 * rates * (p + end)
+    dangle = s * rates * (dp + dend) + (s * drates + ds * rates) * (p + end)
+    small = dangle / 2 - jnp.cross(angle, dangle) / 4
+    theta = jnp.where(is_small, small, (along + jnp.cross(end, change)) / square)
+    half = jnp.concatenate([jnp.zeros_like(theta[..., :1]), theta / 2], axis=-1)
+    return (turn, end), lax.optimization_barrier((multiply(turn, half), dend))

@@ -1,6 +1,7 @@
 """The multipliers of constraints: linear systems, and Newton's method."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.lax as lax
@@ -17,6 +18,9 @@ LinearMap = Callable[[Multipliers], Multipliers]
 
 # It converges in two to five steps, or the step of the scheme is too long.
 _MOST_STEPS = 12
+# On a CPU XLA makes one function of a loop, unless it calls LAPACK: with 3 and 10
+# constraints that is 8 and 2 times slower, with 20 it is faster.
+_MOST_ELIMINATED = 16
 
 
 def solve(
@@ -24,8 +28,14 @@ def solve(
 ) -> Multipliers:
     """The solution of a linear system, by its matrix unless a solver is given; NaN if
     there is none."""
+    if solver is None and b.size <= _MOST_ELIMINATED:
+        return lax.custom_linear_solve(linear, b, _eliminate, _eliminate)
     operator = lambda linear, like: _operator(linear, like, solver)
     return solve_linear(linear, b, lx.LU() if solver is None else solver, operator)
+
+
+def _matrix(linear: LinearMap, like: Any) -> Inexact[Array, "constraints constraints"]:
+    return jax.vmap(linear, out_axes=1)(jnp.eye(like.size, dtype=like.dtype))
 
 
 def _operator(
@@ -41,9 +51,27 @@ def _operator(
         lower, diagonal, upper = (columns[(row + k) % 3, row] for k in (-1, 0, 1))
         return lx.TridiagonalLinearOperator(diagonal, lower[1:], upper[:-1])
     if solver is None:
-        matrix = jax.vmap(linear, out_axes=1)(jnp.eye(like.size, dtype=like.dtype))
-        return lx.MatrixLinearOperator(matrix)
+        return lx.MatrixLinearOperator(_matrix(linear, like))
     return lx.FunctionLinearOperator(linear, like)
+
+
+def _eliminate(linear: LinearMap, b: Multipliers) -> Multipliers:
+    """By Gauss and Jordan, with pivots."""
+    matrix, row = _matrix(linear, b), jnp.arange(b.size)
+
+    def step(k: Array, x: Array) -> Array:
+        column = lax.dynamic_index_in_dim(x, k, 1, keepdims=False)
+        size = jnp.where(row < k, -1, jnp.abs(column))
+        chosen, old = (row == jnp.argmax(size))[:, None], x[k]
+        pivot = jnp.sum(jnp.where(chosen, x, 0), axis=0)
+        x = jnp.where(chosen, old[None], x)
+        pivot = pivot / pivot[k]
+        return jnp.where(
+            (row == k)[:, None], pivot[None], x - x[:, k, None] * pivot[None]
+        )
+
+    start = jnp.concatenate([matrix, b[:, None]], axis=1)
+    return lax.fori_loop(0, b.size, step, start)[:, -1]
 
 
 def is_regular(
