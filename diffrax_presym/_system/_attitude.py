@@ -33,7 +33,6 @@ class Attitude(AbstractManifold):
     """
 
     inertia: Float[Array, "*bodies 3"]
-    is_exact: ClassVar[bool] = True
     is_free: ClassVar[bool] = True
 
     def __init__(self, inertia):

@@ -106,10 +106,6 @@ class ManifoldSystem(AbstractSystem):
         return self.map(lambda _, x: x[0], pairs), self.map(lambda _, x: x[1], pairs)
 
     @property
-    def is_exact(self) -> bool:
-        return all(jtu.tree_leaves(self.map(lambda m: m.is_exact)))
-
-    @property
     def is_free(self) -> bool:
         return all(jtu.tree_leaves(self.map(lambda m: m.is_free)))
 
@@ -228,8 +224,7 @@ class ManifoldSplit(AbstractForceSplit):
 
     def prepare(self, system, t, h, order) -> PyTree:
         friction, shortens = system.friction, _only_shortens(system)
-        is_exact = system.term.is_exact and shortens
-        h = jnp.reshape(h, 1) if is_exact else lengths(order, h)
+        h = jnp.reshape(h, 1) if shortens else lengths(order, h)
         if friction is None:
             return h, None
         starts, prepare = (

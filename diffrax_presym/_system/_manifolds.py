@@ -18,8 +18,6 @@ Both = tuple[Array, Array]  # positions and momenta
 class AbstractManifold(eqx.Module):
     """Where an array of positions is, and how it moves there without forces."""
 
-    # Whether `flow` is exact; otherwise it is symmetric, of second order.
-    is_exact: eqx.AbstractClassVar[bool]
     # Whether any momentum is one of the manifold.
     is_free: eqx.AbstractClassVar[bool]
     # As of `QuadraticKinetic`.
@@ -58,7 +56,6 @@ class Euclidean(AbstractManifold):
     """Flat space, as a factor of a product."""
 
     mass: Inexact[Array, "..."]
-    is_exact: ClassVar[bool] = True
     is_free: ClassVar[bool] = True
 
     def __init__(self, mass: ArrayLike = 1.0):
@@ -99,7 +96,6 @@ def sinc(x: Array) -> Array:
 class Sphere(AbstractManifold):
     """Vectors of length one, over the last axis."""
 
-    is_exact: ClassVar[bool] = True
     is_free: ClassVar[bool] = False
     mass: ClassVar[float] = 1.0
 
@@ -125,7 +121,6 @@ class Stiefel(AbstractManifold):
     Edelman, Arias and Smith (1998), SIAM J. Matrix Anal. Appl. 20, 303.
     """
 
-    is_exact: ClassVar[bool] = True
     is_free: ClassVar[bool] = False
     mass: ClassVar[float] = 1.0
 

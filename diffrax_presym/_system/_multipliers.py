@@ -106,7 +106,8 @@ def find_root(
 
         start = x, jnp.array(False), jnp.zeros((), int)
         x, found, _ = lax.while_loop(more, improve, start)
-        return x, found
+        return x, found.astype(x.dtype)  # JAX 0.6 has no derivatives of other types.
 
     tangent = lambda linear, b: solve(linear, b, solver)
-    return lax.custom_root(residual, like, newton, tangent, has_aux=True)
+    x, found = lax.custom_root(residual, like, newton, tangent, has_aux=True)
+    return x, found > 0
