@@ -15,9 +15,13 @@ from py_mini_racer import JSEvalException, MiniRacer
 
 KATEX = pathlib.Path(__file__).parent / "_static" / "katex" / "katex.min.js"
 FORMULA = re.compile(
-    r'(?P<open><(?P<tag>span|div) class="arithmatex">)\\[(\[](?P<latex>.*?)\\[)\]]</',
+    r"(?P<before>\()?"
+    r'(?P<open><(?P<tag>span|div) class="arithmatex">)\\[(\[](?P<latex>.*?)\\[)\]]'
+    r"(?P<close></(?P=tag)>)(?P<after>[,.;:!?)])?",
     re.DOTALL,
 )
+# Between a formula and its punctuation, where browsers would break lines.
+JOINER = "&#8288;"
 
 
 @functools.cache
@@ -39,7 +43,9 @@ def on_page_content(content, page, **kwargs):
         formula = formula.replace(
             '"katex-mathml"', '"katex-mathml" data-search-exclude="true"'
         )
-        return f"{match['open']}{formula}</"
+        before = match["before"] + JOINER if match["before"] else ""
+        after = JOINER + match["after"] if match["after"] else ""
+        return f"{before}{match['open']}{formula}{match['close']}{after}"
 
     return FORMULA.sub(render, content)
 

@@ -42,7 +42,7 @@ def report(name, fig, rows, options) -> None:
     for what, paper, measured in rows:
         print(f"{what}\n    paper says  {paper}\n    we measure  {measured}")
     if options.docs:
-        lines = ["| | paper says | we measure |", "|---|---|---|"]
+        lines = ["| experiment | paper says | we measure |", "|---|---|---|"]
         lines += [f"| {' | '.join(row)} |" for row in rows]
         page = DOCS / "reproduction.md"
         begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
