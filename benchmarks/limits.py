@@ -84,8 +84,8 @@ def main():
     makers = makers[: 1 if options.quick else None]
     table = Table(
         f"Microseconds of one trajectory to an error of {TARGET:.0e}",
-        *(":<24", "ours:<16", "time:>6.0f", "call:>6.0f", "forces:>7.0f"),
-        *("rest:>6.0f", "heyoka:>7.0f", "ratio:>6.2f", "no rest:>8.2f"),
+        *(":<23", "ours:<15", "time:>5.0f", "call:>4.0f", "forces:>6.0f"),
+        *("rest:>4.0f", "heyoka:>6.0f", "ratio:>5.2f", "no rest:>8.2f"),
         "forces alone:>13.2f",
     )
     ratios = []

@@ -142,8 +142,8 @@ def tried(rho, steps, eccentricities):
 
 def resonances(steps, eccentricities):
     shown = [f"{steps[i]:.0f} steps:>9.1e" for i in range(12, len(steps), 20)]
-    columns = "stable to:>9.2f", *(f"drift, e = {e}:>15" for e in eccentricities)
-    table = Table("Methods on Kepler orbits", "method:<31", *columns, *shown)
+    columns = "stable to:>9.2f", *(f"drift, e = {e}:>14" for e in eccentricities)
+    table = Table("Methods on Kepler orbits", "method:<30", *columns, *shown)
     methods = {f"order {n}": from_cosines(COSINES[n]) for n in COSINES}
     methods |= {name: (*rho, *rho[-2::-1]) for name, rho in PUBLISHED.items()}
     for name, rho in sorted(methods.items(), key=lambda x: len(x[1])):

@@ -175,8 +175,8 @@ def tables(results):
     """Print them, and return the ratios of times for each problem and their mean."""
     ratios, heyoka, work = [], [], []
     for target in TARGETS:
-        label = f"to an error of {target:.0e}:<22"
-        table = Table("", label, "ours:>19", "us:>6.0f", "Diffrax's:>19", "us:>6.0f")
+        label = f"to an error of {target:.0e}:<23"
+        table = Table("", label, "ours:>24", "us:>6.0f", "Diffrax's:>19", "us:>6.0f")
         both = []
         for problem, curves in results.items():
             best = [fastest(curves, target, x) for x in GROUPS]

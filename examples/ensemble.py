@@ -222,7 +222,7 @@ def simulate(options):
     verdict = "bitwise equal" if bitwise else f"equal to {largest:.1e}"
     print(
         f"process {me}: {seconds:.2f} s; compared with one device: {verdict};"
-        f" communication in the compiled program: {described(program)}",
+        f" communication in the program: {described(program)}",
         flush=True,
     )
     if processes == 1 and mesh.size > 1:

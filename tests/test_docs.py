@@ -126,6 +126,16 @@ def test_blocks_say_their_language(page):
     assert languages <= {"bash", "bibtex", "python", "sh", "text"}
 
 
+@pytest.mark.variants(1000)
+@pytest.mark.parametrize("page", PAGES, ids=lambda x: str(x.relative_to(ROOT)))
+def test_blocks_fit_the_page(page):
+    # In a window of 1280 pixels. The letters of folded blocks are smaller.
+    for block in FENCE.finditer(page.read_text()):
+        indent = len(block["indent"])
+        longest = max(map(len, block["code"].splitlines()), default=0) - indent
+        assert longest <= (110 if indent else 100), block[0]
+
+
 def test_pages_with_figures_have_names_of_their_own():
     assert len({page.stem for page in FIGURES}) == len(FIGURES)
 
