@@ -20,8 +20,6 @@ FORMULA = re.compile(
     r"(?P<close></(?P=tag)>)(?P<after>[,.;:!?)])?",
     re.DOTALL,
 )
-# Between a formula and its punctuation, where browsers would break lines.
-JOINER = "&#8288;"
 
 
 @functools.cache
@@ -43,9 +41,12 @@ def on_page_content(content, page, **kwargs):
         formula = formula.replace(
             '"katex-mathml"', '"katex-mathml" data-search-exclude="true"'
         )
-        before = match["before"] + JOINER if match["before"] else ""
-        after = JOINER + match["after"] if match["after"] else ""
-        return f"{before}{match['open']}{formula}{match['close']}{after}"
+        formula = f"{match['open']}{formula}{match['close']}"
+        # Browsers would break lines between a formula and its punctuation.
+        before, after = match["before"] or "", match["after"] or ""
+        if before or after:
+            formula = f'<span class="punctuated">{before}{formula}{after}</span>'
+        return formula
 
     return FORMULA.sub(render, content)
 
