@@ -210,7 +210,7 @@ def picture_scan(found, path):
         ax.set(yscale="log", title=name, ylim=(hs[0], hs[-1]))
         ax.set(xscale="log", xlabel=r"coupling $\xi$")
         for k in (1, 2, 3):
-            ax.plot(k * np.pi / 2 / hs, hs, "w:", lw=1)
+            ax.plot(k * np.pi / 2 / hs, hs, "k:", lw=1.2)
         if "order" in name:
             ax.plot(3 * np.pi / 16 / hs, hs, "r--", lw=1.5)
         ax.set_xlim(values[0], values[-1])
