@@ -306,7 +306,8 @@ def picture(temperatures, observed, losses, every, shown):
             ax.plot(temperatures, observed[name][i], **look)
         ax.axvline(ising.CRITICAL_TEMPERATURE, color="0.8", lw=0.8)
         ax.set(xlabel="temperature T", ylabel=f"{label} per spin")
-    axes[0].legend(fontsize=8, loc="lower right")
+    handles, labels = axes[0].get_legend_handles_labels()
+    fig.legend(handles, labels, fontsize=8, ncols=6, loc="outside lower left")
     for name, curve in losses.items():
         axes[2].semilogy(every * np.arange(1, len(curve) + 1), curve, label=name)
     axes[2].set(
