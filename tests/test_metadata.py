@@ -73,3 +73,25 @@ def test_paper_has_the_numbers_of_the_benchmark(row, nth):
     assert [x.strip() for x in found.split("|")] == [
         f"{mean} ({low})" for mean, low in zip(*cells, strict=True)
     ]
+
+
+@pytest.mark.parametrize("nth", [0, 1], ids=["final", "saved"])
+def test_readme_has_the_numbers_of_the_benchmark(nth):
+    test, _ = text("docs", "speed.md").split("## The tuning half")
+    rows = re.findall(r"^\| (\**[^|*]+\**) \|([^a-z]+)\|$", test, re.M)
+    times = {
+        name.strip("* "): [x.strip(" *") for x in cells.split("|")][:3]
+        for name, cells in rows[16 * nth : 16 * (nth + 1)]
+    }
+    mean, least = times.pop("geometric mean"), times.pop("least")
+    assert len(times) == 14
+    columns = [sorted(map(float, x)) for x in zip(*times.values(), strict=True)]
+    assert [str(x[0]) for x in columns] == least
+    ranges = [f"{x[0]} to {x[-1]}" for x in columns]
+    table = re.findall(
+        r"^\|[^|]*, mean \|.*\n\| its range \|.*$", text("README.md"), re.M
+    )
+    shown = [
+        [x.strip() for x in line.split("|")[2:5]] for line in table[nth].split("\n")
+    ]
+    assert shown == [mean, ranges]
