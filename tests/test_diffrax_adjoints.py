@@ -13,7 +13,7 @@ import diffrax_presym as dps
 
 
 NONE, *LAWS = [x for x in catalogue.FRICTION if x.limit is None and x.kink is None]
-BODIES = next(x for x in catalogue.SYSTEMS if x.name == "bodies")
+(BODIES,) = catalogue.named(catalogue.SYSTEMS, "bodies")
 # Without those that collocation would leave the manifold of.
 PAIRS = [(s, NONE) for s in catalogue.SYSTEMS if not s.constrained]
 PAIRS += [(BODIES, x) for x in LAWS if x.name != "operator"]
@@ -43,8 +43,7 @@ def _gradient(system, y0, solver, adjoint):
 @pytest.mark.parametrize("pair", PAIRS, ids=lambda pair: f"{pair[0]}-{pair[1]}")
 def test_gradients_by_the_adjoints_of_diffrax(pair, name):
     system, friction = pair
-    external = {} if friction.external is None else {"force": friction.external}
-    built = system.build(friction.laws(system), **external)
+    built = catalogue.build(system, friction)
     y0 = jax.tree.map(jnp.asarray, catalogue.start(system, friction))
     exact = _gradient(built, y0, dfx.Dopri8(), ADJOINTS["DirectAdjoint"])
     assert np.all(np.isfinite(exact)) and np.any(exact != 0)

@@ -8,11 +8,7 @@ central differences.
 """
 
 import dataclasses
-import itertools
-import os
 import pathlib
-import random
-import re
 from functools import cache, cached_property, partial
 
 import catalogue
@@ -25,93 +21,13 @@ import mutants
 import numpy as np
 import orders
 import pytest
-from catalogue import claim, offered, Problem, reference, Refused
+from catalogue import build, claim, Problem, reference, Refused
 from jax.flatten_util import ravel_pytree
+from rows import covering, pairs, sample
 
 import diffrax_presym as dps
 from diffrax_presym._scheme import _engine as engine
 
-
-FACTORS = {
-    "scheme": catalogue.SCHEMES,
-    "friction": catalogue.FRICTION,
-    "system": catalogue.SYSTEMS,
-    "way": catalogue.WAYS,
-    "gradient": catalogue.GRADIENTS,
-    "wrapper": catalogue.WRAPPERS,
-    "precision": catalogue.PRECISIONS,
-}
-
-
-def possible(row: dict) -> bool:
-    """Whether some entries can be tried together. What is refused is tried apart, since
-    a row of it would test none of its other pairs."""
-    scheme, friction, way = (row.get(k) for k in ("scheme", "friction", "way"))
-    if "system" in row and isinstance(claim(row["system"], friction, scheme), Refused):
-        return False
-    if "system" in row and row["system"].react and friction.limit is not None:
-        return False  # a push that infinite friction stops has no effect
-    composes = "wrapper" in row and row["wrapper"].composes
-    if composes and not scheme.composable:
-        return False
-    if "system" in row and row["system"].slow and (composes or scheme.order > 2):
-        return False
-    if way is not None and way.backwards and friction.limit is not None:
-        return False
-    if way is not None and way.name == "HalfSolver" and scheme.name == "Tao":
-        return False  # its docstring says why
-    if row.get("precision") == "float32" and friction.double:
-        return False
-    return "gradient" not in row or way.own == row["gradient"].own
-
-
-def pairs(row: dict) -> set[str]:
-    names = [f"{factor}: {entry}" for factor, entry in row.items()]
-    return set(map(" and ".join, itertools.combinations(sorted(names), 2)))
-
-
-@cache
-def covering() -> list[dict]:
-    """Rows that have all possible pairs: greedily, entry by entry.
-
-    (The greedy algorithm of allpairspy loses pairs to conditions such as these.)
-    """
-    rng = random.Random(0)
-    seen = set()
-
-    def complete(row: dict) -> dict:
-        for name, entries in FACTORS.items():
-            if name not in row:
-                options = [row | {name: x} for x in entries]
-                options = [x for x in options if possible(x)]
-                rng.shuffle(options)
-                row = max(options, key=lambda x: len(pairs(x) - seen))
-        seen.update(pairs(row))
-        return {name: row[name] for name in FACTORS}
-
-    table = []
-    for scheme, friction in itertools.product(*list(FACTORS.values())[:2]):
-        row = {"scheme": scheme, "friction": friction}
-        if any(possible(row | {"system": x}) for x in catalogue.SYSTEMS):
-            table.append(complete(row))
-    # The other pairs. Of systems each scheme and each friction takes only some.
-    triples = itertools.product(*list(FACTORS.values())[:3])
-    triples = [dict(zip(FACTORS, x, strict=False)) for x in triples]
-    triples = list(filter(possible, triples))
-    rng.shuffle(triples)
-    for names in itertools.combinations(FACTORS, 2):
-        for entries in itertools.product(*(FACTORS[name] for name in names)):
-            pair = dict(zip(names, entries, strict=True))
-            if pairs(pair) <= seen:
-                continue
-            rows = (x | pair for x in triples if (x | pair).items() >= x.items())
-            row = next(filter(possible, rows), None)
-            if row is not None:
-                table.append(complete(row))
-    return table
-
-
-# One row.
 
 NUMBERS = [4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256]
 
@@ -120,23 +36,13 @@ def flat(y) -> np.ndarray:
     return np.concatenate([np.ravel(np.asarray(x, float)) for x in jtu.tree_leaves(y)])
 
 
-def build(system, friction):
-    external = {} if friction.external is None else {"force": friction.external}
-    return system.build(friction.laws(system), **external)
-
-
-def make(scheme, precision):
-    finder = [catalogue.finder(precision)] if scheme.implicit else []
-    return scheme.make(*finder)
-
-
 class Run:
     """A row as a function of the number of steps and what can be differentiated."""
 
     def __init__(self, row: dict, adjoint, precision: str):
         self.row, self.way = row, row["way"]
         self.system = build(row["system"], row["friction"])
-        self.bare = make(row["scheme"], precision)
+        self.bare = row["scheme"].for_precision(precision)
         self.solver = row["wrapper"].wrap(self.bare)
         t0, t1 = catalogue.span(row["system"], row["friction"])
         self.t0, self.t1 = (jnp.asarray(t, precision) for t in (t0, t1))
@@ -350,70 +256,7 @@ def _near(y, z):
     return np.max(np.abs(y[taken] - z[taken]), initial=0) < 2e-4
 
 
-# What is refused.
-
-
-@cache
-def refusals() -> dict[str, list[tuple]]:
-    """By scheme, what it must refuse: of systems that differ in nothing that matters,
-    one. Without a scheme, systems that do not take a friction."""
-    found, seen = {}, set()
-    for system, friction in itertools.product(catalogue.SYSTEMS, catalogue.FRICTION):
-        splits = offered(system, friction)
-        if isinstance(splits, Refused):
-            found.setdefault("systems", []).append((system, friction, None))
-            continue
-        for scheme in catalogue.SCHEMES:
-            key = scheme, friction, splits
-            if isinstance(claim(system, friction, scheme), Refused) and key not in seen:
-                seen.add(key)
-                found.setdefault(str(scheme), []).append((system, friction, scheme))
-    return found
-
-
-def check_refusal(system, friction, scheme):
-    """An error before any compute that says what to write instead."""
-    with pytest.raises(ValueError) as error:
-        built = build(system, friction)
-        y0 = jtu.tree_map(jnp.asarray, catalogue.start(system, friction))
-        solver = dfx.Tsit5() if scheme is None else make(scheme, "float64")
-        problem = Problem(built, solver, 0.5, 1.0, dfx.RecursiveCheckpointAdjoint())
-        jax.eval_shape(lambda: problem.solve(0.1, y0, dfx.SaveAt(t1=True)).ys)
-    assert re.search("(?i)write|use |pass ", str(error.value)), error.value
-
-
-def check_composition(scheme, wrapper):
-    with pytest.raises(ValueError) as error:
-        solver = wrapper.wrap(make(scheme, "float64"))
-        system = build(catalogue.SYSTEMS[0], catalogue.FRICTION[0])
-        y0 = catalogue.start(catalogue.SYSTEMS[0], catalogue.FRICTION[0])
-        y0 = jtu.tree_map(jnp.asarray, y0)
-        jax.eval_shape(lambda: solver.init(system, 0.0, 1.0, y0, None))
-    assert re.search("(?i)write|use |compose ", str(error.value)), error.value
-
-
 # Which are tried when.
-
-# The number of rows, and entries that they all have.
-SAMPLE = int(os.environ.get("ROWS", 4))
-ENTRIES = set(os.environ.get("ENTRIES", "").split("|")) - {""}
-
-
-def sample() -> list[dict]:
-    """Some rows that have as many entries as possible."""
-    rest = [x for x in covering() if {*map(str, x.values())} >= ENTRIES]
-    # Constraints take long to compile: they are tried slowly, or if they are asked for.
-    quick = [x for x in rest if not x["system"].constrained]
-    rest = quick or rest
-    random.Random(0).shuffle(rest)
-    entries = lambda row: set(map(str, row.items()))
-    chosen, seen = [], set()
-    for _ in range(min(SAMPLE, len(rest))):
-        row = max(rest, key=lambda row: len(entries(row) - seen))
-        seen = seen | entries(row) if entries(row) - seen else entries(row)
-        rest.remove(row)
-        chosen.append(row)
-    return chosen
 
 
 def rows() -> list:
@@ -431,25 +274,6 @@ def test_pair(row, record_property):
     record_property("pairs", sorted(pairs(row)))
 
 
-@pytest.mark.parametrize("scheme", list(refusals()))
-@pytest.mark.slow
-def test_refusals(scheme, record_property):
-    for refusal in refusals()[scheme]:
-        check_refusal(*refusal)
-    record_property("refused", len(refusals()[scheme]))
-
-
-def test_some_refusals(record_property):
-    everything = [x for some in refusals().values() for x in some]
-    number = min(20 * SAMPLE, len(everything))
-    for refusal in random.Random(0).sample(everything, number):
-        check_refusal(*refusal)
-    record_property("refused", number)
-    for scheme, wrapper in itertools.product(catalogue.SCHEMES, catalogue.WRAPPERS):
-        if wrapper.composes and not scheme.composable:
-            check_composition(scheme, wrapper)
-
-
 def test_all_that_is_exported_is_in_the_catalogue():
     def classes(x):
         yield type(x)
@@ -460,7 +284,7 @@ def test_all_that_is_exported_is_in_the_catalogue():
             for y in x:
                 yield from classes(y)
 
-    schemes = [make(scheme, "float64") for scheme in catalogue.SCHEMES]
+    schemes = [scheme.solver for scheme in catalogue.SCHEMES]
     wrapped = [wrapper.wrap(dps.Strang()) for wrapper in catalogue.WRAPPERS]
     systems = [build(system, catalogue.FRICTION[0]) for system in catalogue.SYSTEMS]
     laws = [x.laws(catalogue.SYSTEMS[6]) for x in catalogue.FRICTION]
