@@ -62,15 +62,6 @@ def triple_jump(base, order):
     return scheme
 
 
-def repeat(base, n):
-    def scheme(H, t, h, *y):
-        for i in range(n):
-            y = base(H, t + i * h / n, h / n, *y)
-        return y
-
-    return scheme
-
-
 def tao(coupling):
     """Equations (tao_map1) to (tao_flow), for `(q, P)` and its copy.
 
@@ -106,18 +97,13 @@ def tao(coupling):
     return scheme
 
 
-fixed_tao = tao(lambda h: 5.0)
-
-# By the names of `helpers.SCHEMES`.
+# By the names of the catalogue.
 SCHEMES: dict[str, Callable[..., tuple]] = {
-    "euler_A": euler_A,
-    "euler_B": euler_B,
-    "leapfrog_AB": leapfrog_AB,
-    "leapfrog_BA": leapfrog_BA,
-    "suzuki_yoshida_4": triple_jump(leapfrog_AB, 4),
-    "suzuki_yoshida_4_BA": triple_jump(leapfrog_BA, 4),
-    "substeps": repeat(leapfrog_AB, 3),
-    "tao": tao(lambda h: 3 * np.pi / 16 / abs(h)),
-    "tao_fixed": fixed_tao,
-    "tao_4": triple_jump(fixed_tao, 4),
+    "Euler": euler_A,
+    "Euler, position first": euler_B,
+    "leapfrog": leapfrog_AB,
+    "leapfrog, position first": leapfrog_BA,
+    "Suzuki-Yoshida 4": triple_jump(leapfrog_AB, 4),
+    "Tao": tao(lambda h: 3 * np.pi / 16 / abs(h)),
+    "Tao 4": triple_jump(tao(lambda h: 4.0), 4),
 }

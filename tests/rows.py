@@ -1,3 +1,4 @@
+# pyright: reportOptionalMemberAccess=false, reportArgumentType=false
 """Rows of the catalogue: one entry of each list, so that each pair is in some row."""
 
 import itertools

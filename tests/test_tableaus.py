@@ -1,18 +1,22 @@
-# pyright: reportOptionalMemberAccess=false
-"""The tabulated schemes: their coefficients, order, structure and cost."""
+# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
+"""The tabulated schemes: their coefficients and cost, and long steps of linear forces.
+Their order is tested by `test_pairs.py`, their structure by `test_structure.py`."""
 
 import json
 import math
 import pathlib
+import sys
+from fractions import Fraction
+from itertools import zip_longest
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, flat, solve
+from helpers import assert_close, solve
 
 import diffrax_presym as dps
+from diffrax_presym._scheme._multistep import _MOST_FRICTION, _TABLES
 
 
 TABLES = json.loads(pathlib.Path(__file__).with_name("tableaus.json").read_text())
@@ -27,9 +31,6 @@ COMPOSITIONS = {
     "SuzukiYoshida6": dps.SuzukiYoshida(6),
     "SuzukiYoshida8": dps.SuzukiYoshida(8),
 }
-SCHEMES = SPLITTINGS | COMPOSITIONS
-# The triple jumps are tested with the other schemes of the paper.
-NEW = [name for name in SCHEMES if not name.startswith("SuzukiYoshida")]
 
 
 @pytest.mark.parametrize("name", TABULATED)
@@ -55,73 +56,15 @@ def test_compositions_agree_with_the_tables_to_the_last_digit(name):
     assert abs(math.fsum(solver.weights) - 1) < 1e-15
 
 
-@pytest.mark.parametrize("name", NEW)
-def test_schemes_are_symmetric(name):
-    assert SCHEMES[name].is_symmetric
-
-
-@pytest.mark.parametrize("name", [name for name in NEW if name in TABLES])
+@pytest.mark.parametrize(
+    "name", [x for x in TABLES if x[:6] in ("Blanes", "Suzuki4", "Sofron")]
+)
 def test_coefficients_are_symmetric(name):
     table = TABLES[name]["coefficients"]
     assert table == table[::-1]
 
 
-# Two nonlinear systems in which all parts depend on time.
-
-
-def pendulum_on_a_moving_pivot(t, q, args):
-    return -jnp.sum(jnp.cos(q)) * (1 + 0.3 * jnp.sin(t))
-
-
-def driven_double_well(t, q, args):
-    return jnp.sum(q**4 / 4 - q**2 / 2 - 0.3 * q * jnp.cos(1.2 * t))
-
-
-SYSTEMS = {
-    "pendulum": dps.DissipativeHamiltonian(
-        dps.QuadraticKinetic(2.0),
-        pendulum_on_a_moving_pivot,
-        eta1=dps.ConstantDamping(0.1),
-        eta2=dps.LogDamping(1.0, shift=1.0),
-    ),
-    "double well": dps.MechanicalSystem(
-        dps.QuadraticKinetic(),
-        driven_double_well,
-        [dps.LogDamping(0.3), dps.PowerDamping(0.1, 0.5)],
-    ),
-}
 Y0 = (jnp.array([1.0, 0.5]), jnp.array([0.3, -0.7]))
-T0, T1 = 1.0, 5.0
-
-
-@eqx.filter_jit
-def one_step(system, solver, y, t0, t1):
-    term = system
-    carry = solver.init(term, t0, t1, y, None)
-    return solver.step(term, t0, t1, y, None, carry, made_jump=False)[0]
-
-
-@pytest.mark.parametrize("system", SYSTEMS)
-@pytest.mark.parametrize("name", NEW)
-def test_a_step_contracts_the_form_by_the_damping(name, system):
-    t0, t1 = jnp.array(1.0), jnp.array(1.2)
-    hamiltonian, solver = SYSTEMS[system], SCHEMES[name]
-
-    def step(x):
-        return flat(one_step(hamiltonian, solver, (x[:2], x[2:]), t0, t1))
-
-    jacobian = jax.jacfwd(step)(flat(Y0))
-    omega = np.kron([[0, -1], [1, 0]], np.eye(2))
-    contraction = np.exp(-hamiltonian.damping.increment(t0, t1 - t0))
-    assert np.max(np.abs(jacobian.T @ omega @ jacobian - contraction * omega)) < 1e-13
-
-
-@pytest.mark.parametrize("name", NEW)
-def test_a_step_backwards_undoes_a_step(name):
-    system, solver = SYSTEMS["double well"], SCHEMES[name]
-    t0, t1 = jnp.array(1.0), jnp.array(1.3)
-    there = one_step(system, solver, Y0, t0, t1)
-    assert_close(one_step(system, solver, there, t1, t0), Y0, 1e-14)
 
 
 @pytest.mark.parametrize("name", SPLITTINGS)
@@ -168,11 +111,92 @@ def test_a_splitting_of_your_own():
     assert_close(ys, (middle + h / 2 * kicked, kicked), 1e-15)
 
 
-def test_splittings_that_do_not_add_up_are_refused():
-    make = lambda *fractions: dps.Splitting(
-        dps.SplittingTableau(2, kick_first=True, kind="any", fractions=fractions)
-    )
-    with pytest.raises(ValueError, match="sum to one"):
-        make(0.5, 0.9, 0.5)
-    with pytest.raises(ValueError, match="odd number of moves"):
-        make(1.0, 1.0)
+# Linear forces.
+
+
+def _series(fractions, kick_first, degree):
+    """A step of an oscillator as exact polynomials in step size times frequency."""
+    one, zero = [Fraction(1)], [Fraction(0)]
+    rows = [[one, zero], [zero, one]]
+    for i, fraction in enumerate(fractions):
+        kick = (i % 2 == 0) == kick_first
+        to, source, sign = (1, 0, -1) if kick else (0, 1, 1)
+        length = sign * Fraction(fraction)
+        for column in (0, 1):
+            moved = [Fraction(0), *(length * x for x in rows[source][column])]
+            pairs = zip_longest(rows[to][column], moved, fillvalue=Fraction(0))
+            rows[to][column] = [x + y for x, y in pairs]
+    return [[float(x) for x in entry[:degree]] for row in rows for entry in row]
+
+
+def test_a_step_of_an_oscillator_is_its_rotation_to_eighth_order():
+    tableau, degree = dps.TunedLinear8().tableau, 9
+    cos, sin = np.zeros((2, degree))
+    for k in range(degree):
+        (cos, sin)[k % 2][k] = (-1) ** (k // 2) / math.factorial(k)
+    series = _series(tableau.fractions, tableau.kick_first, degree)
+    for computed, exact in zip(series, (cos, sin, -sin, cos), strict=True):
+        padded = [*computed, *[0.0] * (degree - len(computed))]
+        assert np.max(np.abs(padded - exact)) < 1e-15
+
+
+@pytest.mark.parametrize("gamma", [0.0, 0.5, 5.0, -0.1])
+def test_long_steps_of_a_linear_system(gamma):
+    # Frequencies up to the claimed limit for an error of 1e-9 per step.
+    omega, steps = jnp.linspace(0.1, 3.6, 50), 4
+    springs, friction = dps.QuadraticPotential(omega**2), dps.ConstantDamping(gamma)
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), springs, friction)
+    y0 = jnp.ones(50), jnp.zeros(50)
+    ys = solve(system, dps.TunedLinear8(), 0.0, float(steps), 1.0, y0).ys
+    shifted = np.sqrt(np.asarray(omega, complex) ** 2 - gamma**2 / 4)
+    decay, phase = np.exp(-gamma * steps / 2), shifted * steps
+    q = decay * (np.cos(phase) + gamma / 2 / shifted * np.sin(phase)).real
+    p = -decay * (np.asarray(omega) ** 2 / shifted * np.sin(phase)).real
+    size = np.maximum(1, np.abs(q)) if gamma < 0 else np.max(np.abs(q))
+    assert np.max(np.abs(ys[0][-1] - q) / size) < steps * 4e-9
+    assert np.max(np.abs(ys[1][-1] - p) / size) < steps * 4e-9 * 3.6
+
+
+# Symmetric multistep methods.
+
+
+@pytest.mark.parametrize("order", _TABLES)
+def test_coefficients(order, monkeypatch):
+    # For x = t^k: sum alpha_j j^k = k (k - 1) sum beta_j j^(k - 2).
+    table = _TABLES[order]
+    alpha = np.convolve(table.kicks, [1, -2, 1])
+    beta = np.array([0, *table.forces, 0])
+    j = np.arange(order + 1) - order / 2
+    defects = [
+        abs(alpha @ j**k - k * (k - 1) * (beta @ j ** max(k - 2, 0))) / (order / 2) ** k
+        for k in range(order + 3)
+    ]
+    assert max(defects[:-1]) < 1e-11 < 1e-4 < defects[-1]
+    # All roots but the double one at 1 are simple and on the unit circle.
+    roots = np.roots(table.kicks)
+    assert np.allclose(np.abs(roots), 1, atol=1e-10)
+    assert np.min(np.abs(roots - 1)) > 0.1
+    assert np.min(np.abs(roots[:, None] - roots) + 2 * np.eye(order - 2)) > 0.02
+    # The script of the coefficients still finds them.
+    folder = pathlib.Path(__file__).parents[1] / "benchmarks"
+    monkeypatch.syspath_prepend(str(folder))
+    import multistep  # pyright: ignore[reportMissingImports]
+
+    assert table == multistep.method(multistep.from_cosines(multistep.COSINES[order]))
+    for name in ("multistep", "_report"):
+        sys.modules.pop(name)
+
+
+def test_most_friction():
+    """The rate of the slow motion, from the largest root of the method."""
+    for order, most in _MOST_FRICTION.items():
+        table = _TABLES[order]
+        alpha = np.convolve(table.kicks, [1, -2, 1])
+        beta = np.array([0, *table.forces, 0])
+
+        def error(x, alpha=alpha, beta=beta):
+            root = np.max(np.abs(np.roots(alpha - (x**2 / 4 - 1e-4) * beta)))
+            rate = (x**2 / 4 - 1e-4) ** 0.5 - x / 2
+            return abs((np.log(root) - x / 2) / rate - 1)
+
+        assert error(most) < 0.1 < error(1.02 * most)

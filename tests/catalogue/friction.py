@@ -1,3 +1,4 @@
+# pyright: reportArgumentType=false
 """Laws of friction, each written twice: with the package, and in NumPy."""
 
 import dataclasses

@@ -1,3 +1,4 @@
+# pyright: reportCallIssue=false
 """Systems, each written twice: with the package, and in NumPy."""
 
 import jax.numpy as jnp
