@@ -11,7 +11,7 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-pytest.register_assert_rewrite("helpers")
+pytest.register_assert_rewrite("helpers", "errors")
 
 # Traced programs are many small objects, which Python would count again and again.
 gc.set_threshold(100_000, 20, 50)
