@@ -11,7 +11,7 @@ import optimistix as optx
 import pytest
 import scipy.linalg
 import scipy.special
-from helpers import harmonic, solve
+from helpers import harmonic, mixed_energy, solve, substeps
 
 import diffrax_presym as dps
 
@@ -170,6 +170,54 @@ def test_the_message_of_a_step_that_is_too_long(finder):
     sol = solve(dps.Hamiltonian(energy), solver, 0.0, 4.0, 1.0, y0, throw=False)
     message = dfx.RESULTS[sol.result]
     assert f"The {name}" in message and "Take shorter steps" in message
+
+
+# A root that is not found is a result
+
+
+def hard_energy(t, q, p, args):
+    """Not separable, and linear for a root finder except in a time interval."""
+    start, end = args
+    hard = jnp.where((t >= start) & (t <= end), 1.0, 0.0)
+    return jnp.sum(q**2 + p**2) / 2 + hard * mixed_energy(t, q, p, None)
+
+
+# Two steps of Newton's method solve a linear equation and confirm convergence.
+MIDPOINT = dps.PresymplecticGauss(1, optx.Newton(rtol=1e-10, atol=1e-10), 2)
+# Schemes, and the times at which their root finds fail: in the first or the last step,
+# the first or the last stage.
+UNSOLVED = {
+    "midpoint": (MIDPOINT, (0.125, 0.875)),
+    "Suzuki4": (dps.Suzuki4(MIDPOINT), (0.0518, 0.9482)),
+    "substeps": (substeps(MIDPOINT, 2), (0.0625, 0.9375)),
+}
+
+
+@pytest.mark.parametrize("solver, times", UNSOLVED.values(), ids=UNSOLVED)
+def test_roots_that_are_not_found_are_a_result(solver, times):
+    y0 = jnp.array([0.7, -0.3]), jnp.array([0.4, 0.9])
+
+    def find(solver, start, end):
+        args = dps.Hamiltonian(hard_energy), solver, 0.0, 1.0, 0.25, y0
+        window = jnp.array(start), jnp.array(end)
+        return solve(*args, window, throw=False).result
+
+    assert find(solver, 2.0, 2.0) == dfx.RESULTS.successful
+    for t in times:
+        message = dfx.RESULTS[find(solver, t - 0.01, t + 0.01)]
+        assert "root finder of `PresymplecticGauss` did not find the stages" in message
+    # Tolerances that cannot be met.
+    never = dps.PresymplecticGauss(1, optx.Newton(rtol=0.0, atol=0.0))
+    assert find(never, 0.0, 1.0) != dfx.RESULTS.successful
+
+
+def test_the_derivative_in_time_of_a_stage_in_the_middle_of_its_step():
+    law = dps.ViscousDamping(jnp.array([[0.5, 0.4], [0.1, 0.8]]))
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), harmonic, law)
+    gauss, options = dps.PresymplecticGauss(1), {"adjoint": dfx.ForwardMode()}
+    loss = lambda h: jnp.sum(solve(system, gauss, 0.0, h, h, Y0, **options).ys[0])
+    wanted = (loss(0.3 + 1e-5) - loss(0.3 - 1e-5)) / 2e-5
+    np.testing.assert_allclose(jax.jacfwd(loss)(0.3), wanted, 1e-7)
 
 
 # Friction that is strong over a step

@@ -40,7 +40,6 @@ def test_energies():
 
 
 @pytest.mark.variants(1)
-@pytest.mark.variants(1)
 @pytest.mark.parametrize("term", [TERM, DRIVEN], ids=["damped", "driven"])
 def test_energy_error_is_that_of_the_solver(term):
     def error(solver):
@@ -120,3 +119,30 @@ def test_structure_defect():
     assert defect(dps.BlanesCasasRKN8()) < 1e-13
     assert 1e-9 < defect(dfx.Tsit5()) < 1e-3
     assert 1e-3 < defect(dfx.Euler())
+
+
+def test_integer_times():
+    assert diagnostics.structure_defect(TERM, dps.Strang(), 0, 1, Y0) < 1e-14
+
+
+def test_other_friction_is_not_conformal():
+    system = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), harmonic, dps.ViscousDamping(jnp.eye(1))
+    )
+    with pytest.raises(ValueError, match="other friction"):
+        diagnostics.structure_defect(system, dps.TunedRKN6(), 0.0, 0.1, Y0)
+
+
+@pytest.mark.parametrize("times", [[0.0, 3000.0], [0.0]])
+def test_the_energy_balance_over_long_times(times):
+    system, ts = oscillator(1e-3), jnp.array(times)
+    sol = dfx.diffeqsolve(
+        *(system, dps.TunedRKN6(), 0.0, 3e3, 0.25, Y0),
+        saveat=dfx.SaveAt(ts=ts),
+        adjoint=dps.FixedStepAdjoint(),
+        max_steps=None,
+    )
+    assert sol.ys is not None
+    error = diagnostics.energy_error(system, ts, sol.ys)
+    assert error.shape == ts.shape
+    assert np.max(np.abs(error)) < 1e-8

@@ -1,7 +1,10 @@
-# pyright: reportOptionalMemberAccess=false
+# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
+# pyright: reportGeneralTypeIssues=false
 """Laws of friction as operators, at their singular times and in their limits."""
 
 import functools
+from functools import partial
+from typing import Any
 
 import diffrax as dfx
 import jax
@@ -162,34 +165,12 @@ def test_interpolated_friction_in_a_solve(name):
     np.testing.assert_allclose(jax.grad(loss)(1.0), central, rtol=1e-6)
 
 
-@pytest.mark.parametrize("solver", [dps.TunedRKN6(), dps.Suzuki4()])
-def test_singular_start_with_several_laws(solver):
-    """All is lost at once, after which the decay is constant to rounding."""
-    laws = [dps.LogDamping(3.0), dps.PowerDamping(0.4, 0.5)]
-    system = dps.MechanicalSystem(dps.QuadraticKinetic(), harmonic, laws)
-    y0 = jnp.array([1.0, 0.5]), jnp.zeros(2)
-    ys = dfx.diffeqsolve(
-        *(system, solver, 0.0, 3.0, 0.01, y0),
-        max_steps=None,
-        adjoint=dps.FixedStepAdjoint(),
-    ).ys
-    # From rest the motion starts as that without the weaker law: q = q0 (1 - t^2 / 8).
-    vf = lambda t, y: np.concatenate([y[2:], -y[:2] - (3 / t + 0.2 / t**0.5) * y[2:]])
-    t = 1e-6
-    start = np.concatenate([y0[0] * (1 - t**2 / 8), -y0[0] * t / 4])
-    exact = scipy.integrate.solve_ivp(vf, (t, 3.0), start, "LSODA", rtol=1e-11)
-    np.testing.assert_allclose(np.ravel(ys), exact.y[:, -1], rtol=0, atol=1e-3)
-
-
-def test_diagnostics_take_integer_times():
-    system = dps.MechanicalSystem(
-        dps.QuadraticKinetic(), harmonic, dps.ConstantDamping(0.1)
-    )
-    y = jnp.array([0.3]), jnp.array([0.7])
-    assert dps.diagnostics.structure_defect(system, dps.Strang(), 0, 1, y) < 1e-14
-
-
 # From rest at the time when friction is infinite.
+
+
+PRECISE: dict[str, Any] = dict(
+    stepsize_controller=dfx.PIDController(rtol=1e-12, atol=1e-12), max_steps=20_000
+)
 
 
 def singular_system(law):
@@ -259,6 +240,67 @@ def test_a_power_alone_from_rest(solver):
     ).y[0]
     found = positions(law, 0.01, solver)
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-4)
+
+
+def test_an_entry_without_friction_beside_one_with_a_singularity():
+    system = singular_system(dps.LogDamping(jnp.array([3.0, 0.0])))
+    y0 = jnp.ones(2), jnp.array([0.0, 1.0])
+    q, p = solve(system, dps.TunedRKN6(), 0.0, 2.0, 0.1, y0).ys
+    exact = np.cos(2) + np.array([1, -1]) * np.sin(2)
+    np.testing.assert_allclose([q[-1, 1], p[-1, 1]], exact, atol=1e-10)
+
+
+NUMBERS, LOG = jnp.array([3.0, 2.0]), dps.LogDamping(3.0)
+both = partial(dps.DissipativeHamiltonian, dps.QuadraticKinetic(), harmonic)
+EQUAL = {
+    "one law as two": (
+        singular_system([dps.LogDamping(NUMBERS - 1), dps.LogDamping(1.0)]),
+        singular_system(dps.LogDamping(NUMBERS)),
+    ),
+    "both energies": (both(LOG, LOG), singular_system(LOG)),
+}
+
+
+@pytest.mark.parametrize("one, other", EQUAL.values(), ids=EQUAL)
+def test_equal_laws_from_a_singularity_are_equally_accurate(one, other):
+    y0 = jnp.array([1.0, 2.0]), jnp.zeros(2)
+    solves = [solve(x, dps.TunedRKN6(), 0.0, 2.0, 0.25, y0).ys for x in (one, other)]
+    np.testing.assert_allclose(*map(np.ravel, solves), rtol=1e-12)
+
+
+@pytest.mark.parametrize("shift", [0.0, 1.0])
+def test_two_laws_of_a_relativistic_energy_from_a_singularity(shift):
+    law, t0 = dps.LogDamping(3.0, shift), -shift
+    system = dps.DissipativeHamiltonian(dps.RelativisticKinetic(), harmonic, law, law)
+    args = t0, t0 + 1, 1e-2, (jnp.ones(2), jnp.zeros(2))
+    ys, exact = (
+        np.ravel(solve(system, solver, *args, **options).ys)
+        for solver, options in ((dps.BlanesMoan4(), {}), (dfx.Dopri8(), PRECISE))
+    )
+    np.testing.assert_allclose(ys, exact, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("delta", [0.0, 1.0, 2.0])
+def test_powers_without_a_singularity(delta):
+    system = singular_system(dps.PowerDamping(0.3, delta))
+    args = 0.0, 2.0, 0.1, (jnp.array([1.0, -0.5]), jnp.array([0.2, 0.3]))
+    ys, exact = (
+        np.ravel(solve(system, solver, *args, **options).ys)
+        for solver, options in ((dps.TunedRKN6(), {}), (dfx.Dopri8(), PRECISE))
+    )
+    np.testing.assert_allclose(ys, exact, rtol=0, atol=1e-9)
+
+
+def test_the_derivative_in_time_of_a_power_that_starts_at_zero():
+    def end(law, t0):
+        options = dict(max_steps=20, adjoint=dfx.ForwardMode())
+        y0 = jnp.array([1.0]), jnp.array([0.2])
+        args = singular_system(law), dps.Strang(), t0, t0 + 1, 0.1, y0
+        return solve(*args, **options).ys[0][-1]
+
+    laws = dps.PowerDamping(0.5, 2.0), lambda t: 0.5 * t * t
+    slopes = [jax.jacfwd(lambda t0, law=law: end(law, t0))(0.0) for law in laws]
+    np.testing.assert_allclose(*slopes, rtol=0, atol=1e-12)
 
 
 # Limits of single precision.

@@ -10,6 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import diffrax_presym as dps
+from diffrax_presym._loop._steps import Steps
 
 
 OWN = dps.FixedStepAdjoint()
@@ -17,6 +18,10 @@ PENDULUM = dps.MechanicalSystem(
     dps.QuadraticKinetic(),
     lambda t, q, args: -jnp.sum(jnp.cos(q)),
     dps.ConstantDamping(0.1),
+)
+
+QUARTIC = dps.MechanicalSystem(
+    dps.QuadraticKinetic(), lambda t, q, args: jnp.sum(q**4) / 4
 )
 
 
@@ -57,6 +62,31 @@ def test_between_regular_times_there_is_one_step(adjoint, dtype, sign):
         **{"adjoint": adjoint, "max_steps": 4000},  # pyright: ignore
     )
     assert sol.stats["num_steps"] == 2000
+
+
+@pytest.mark.variants(1)
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64], ids=lambda x: x.__name__)
+@pytest.mark.parametrize(
+    "t0, t1, dt0", [(0.0, 1.0, 0.1), (0.3, 7.8, 0.3), (-2.0, 5.0, 7.0)]
+)
+def test_steps_are_found_again_to_rounding(t0, t1, dt0, dtype):
+    t0, t1, dt0 = (jnp.asarray(t, dtype) for t in (t0, t1, dt0))
+    y0, saveat = (jnp.ones(1, dtype),) * 2, dfx.SaveAt(t0=True, steps=True)
+    args = QUARTIC, dps.PresymplecticLeapfrog(), t0, t1, dt0, y0
+    sol = dfx.diffeqsolve(*args, saveat=saveat, max_steps=32)
+    n = int(sol.stats["num_steps"])
+    with jax.numpy_dtype_promotion("standard"):  # as within `diffeqsolve`
+        steps = Steps(dfx.ConstantStepSize(), t0, t1, dt0)
+        times = steps.time(jnp.arange(n + 1))
+        middle = (times[:-1] + times[1:]) / 2
+        starts, inside = steps.locate(times)
+        assert jnp.all(starts == jnp.arange(n + 1)) and not jnp.any(inside)
+        between, inside = steps.locate(middle)
+        assert jnp.all(between == jnp.arange(n)) and jnp.all(inside)
+    ulp = jnp.finfo(dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+    assert sol.ts is not None and n > 0
+    assert jnp.all(jnp.abs(sol.ts[: n + 1] - times) <= 2 * ulp)
+    assert sol.ts[0] == times[0] and sol.ts[n] == times[n] and steps.total == n
 
 
 @pytest.mark.parametrize("dt0", [jnp.nan, -jnp.inf])
@@ -117,17 +147,32 @@ def test_gaps_in_the_saved_times(options):
     assert np.isfinite(alone)
 
 
+NONFINITE: Any = dfx.RESULTS.nonfinite  # pyright: ignore
+
+
+def too_long(t1, dt0, **options) -> Any:
+    args = QUARTIC, dps.TunedRKN6(), 0.0, t1, dt0, (jnp.array([1.0]), jnp.zeros(1))
+    return dfx.diffeqsolve(*args, **({"throw": False, "adjoint": OWN} | options))
+
+
 def test_a_solve_ends_at_the_next_saved_time_after_it_has_failed():
     """Of an explicit scheme, whose steps between are not checked."""
-    system = dps.MechanicalSystem(
-        dps.QuadraticKinetic(), lambda t, q, args: jnp.sum(q**4) / 4
-    )
-    y0 = jnp.array([1.0]), jnp.zeros(1)
-    sol: Any = dfx.diffeqsolve(
-        *(system, dps.TunedRKN6(), 0.0, 1000.0, 10.0, y0),
-        saveat=dfx.SaveAt(ts=jnp.arange(0.0, 1001.0, 50.0)),
-        **{"throw": False, "adjoint": OWN},
-    )
-    assert sol.result == dfx.RESULTS.nonfinite  # pyright: ignore
+    ts = dfx.SaveAt(ts=jnp.arange(0.0, 1001.0, 50.0))
+    sol = too_long(1000.0, 10.0, saveat=ts)
+    assert sol.result == NONFINITE
     assert sol.stats["num_steps"] <= 10
     assert np.all(np.isinf(sol.ts[3:])) and np.all(np.isinf(sol.ys[0][3:]))
+
+
+@pytest.mark.parametrize("adjoint", [OWN, dfx.RecursiveCheckpointAdjoint()])
+def test_a_step_that_is_too_long_is_a_failure(adjoint):
+    sol = too_long(1000.0, 25.0, adjoint=adjoint)
+    assert sol.result == NONFINITE and not np.all(np.isfinite(sol.ys[0]))
+    with pytest.raises(RuntimeError, match=r"[Nn]onfinite"):
+        too_long(1000.0, 25.0, adjoint=adjoint, throw=True)
+
+
+def test_an_infinite_span():
+    sol = too_long(jnp.inf, 0.1, max_steps=30)
+    assert sol.result == dfx.RESULTS.max_steps_reached
+    assert sol.stats["num_steps"] == 30

@@ -1,0 +1,165 @@
+# pyright: reportOptionalSubscript=false, reportCallIssue=false
+"""Gradients where states cannot be recomputed: kept states, or a failure."""
+
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import optimistix as optx
+import pytest
+from helpers import assert_close
+
+import diffrax_presym as dps
+
+
+REVERSIBLE = dps.FixedStepAdjoint()
+FIXED_STEP = dps.FixedStepAdjoint("checkpoints")
+CHECKPOINTED = dfx.RecursiveCheckpointAdjoint()
+LEAPFROG = dps.PresymplecticLeapfrog()
+
+
+def pendulum(gamma):
+    potential = lambda t, q, args: jnp.sum(1 - jnp.cos(q))
+    damping = dps.ConstantDamping(gamma)
+    return dps.MechanicalSystem(dps.QuadraticKinetic(), potential, damping)
+
+
+@eqx.filter_jit
+def damping_gradient(adjoint, inputs):
+    def loss(inputs):
+        q0, gamma = inputs
+        dtype = q0.dtype
+        # Early states are saved, as the final state does not depend on the initial one.
+        saveat = dfx.SaveAt(ts=jnp.linspace(0.0, 4.0, 20, dtype=dtype))
+        times = (jnp.asarray(t, dtype) for t in (0.0, 100.0, 1 / 16))
+        system = pendulum(gamma)
+        args = system, LEAPFROG, *times, (q0, jnp.zeros_like(q0))
+        options: dict[str, Any] = dict(adjoint=adjoint, saveat=saveat, max_steps=1600)
+        sol = dfx.diffeqsolve(*args, **options)
+        return sum(jnp.sum(y**2) for y in jtu.tree_leaves(sol.ys))
+
+    return jax.grad(loss)(inputs)
+
+
+@pytest.mark.parametrize(
+    "dtype, eta, tolerance",
+    [(jnp.float64, 1000.0, 1e-10), (jnp.float32, 100.0, 1e-4)],
+)
+def test_kept_states_make_up_for_what_damping_forgets(dtype, eta, tolerance):
+    """Over some e-folds of damping."""
+    inputs = lambda dtype: (jnp.array([1.0, 0.3], dtype), jnp.asarray(eta / 100, dtype))
+    found = damping_gradient(REVERSIBLE, inputs(dtype))
+    assert all(x.dtype == dtype for x in jtu.tree_leaves(found))
+    assert_close(found, damping_gradient(FIXED_STEP, inputs(jnp.float64)), tolerance)
+
+
+# States that cannot be recomputed.
+
+# States of the last three rates cannot be recomputed between 8 of 1000 kept ones.
+RATES = jnp.concatenate([jnp.linspace(0.0, 5.0, 61), jnp.array([1e3, 3e3, 1e4])])
+
+
+def _damped(gamma, adjoint, throw=True):
+    sol = dfx.diffeqsolve(
+        *(pendulum(gamma), dps.TunedRKN6(), 0.0, 2.0, 2e-3),
+        (jnp.asarray(1.5), jnp.asarray(0.3)),
+        saveat=dfx.SaveAt(ts=jnp.linspace(0.0, 2.0, 7)),
+        adjoint=adjoint,
+        max_steps=1000,
+        throw=throw,
+    )
+    assert sol.ys is not None
+    return jnp.sum(sol.ys[0] ** 2)
+
+
+FEW = dps.FixedStepAdjoint(checkpoints=8)
+
+
+def test_a_gradient_that_is_lost_is_that_of_one_member_of_a_batch():
+    slopes = jax.jit(jax.vmap(jax.grad(lambda gamma: _damped(gamma, FEW))))(RATES)
+    assert jnp.all(jnp.isnan(slopes[-3:]))
+    alone = jax.jit(jax.grad(lambda gamma: _damped(gamma, FEW)))
+    exact = jax.vmap(jax.grad(lambda gamma: _damped(gamma, FIXED_STEP)))(RATES)
+    some = np.arange(0, 61, 12)
+    np.testing.assert_allclose(slopes[some], [alone(x) for x in RATES[some]], rtol=1e-9)
+    np.testing.assert_allclose(slopes[:-3], exact[:-3], rtol=1e-8)
+    # Nothing is inverted between as many kept states as steps.
+    every = dps.FixedStepAdjoint(checkpoints=999)
+    kept = jax.grad(lambda gamma: _damped(gamma, every))(RATES[-1])
+    np.testing.assert_allclose(kept, exact[-1], rtol=1e-12)
+
+
+def test_a_gradient_that_is_lost_is_an_error_or_not_a_number():
+    slope = lambda adjoint, **options: jax.grad(
+        lambda gamma: _damped(gamma, adjoint, **options)
+    )
+    with pytest.raises(Exception, match="with an error beyond"):
+        jax.block_until_ready(slope(FEW)(RATES[-1]))
+    assert jnp.isnan(slope(FEW, throw=False)(RATES[-1]))
+    never = dps.FixedStepAdjoint(checkpoints=8, throw=False)
+    assert jnp.isnan(slope(never)(RATES[-1]))
+    always = dps.FixedStepAdjoint(checkpoints=8, throw=True)
+    with pytest.raises(Exception, match="with an error beyond"):
+        jax.block_until_ready(jax.vmap(slope(always, throw=False))(RATES[-2:]))
+
+
+def test_the_branch_of_a_batch_that_is_not_taken():
+    """JAX differentiates it at zeros, of which no state can be recomputed."""
+
+    def end(k, adjoint):
+        y0, args = (jnp.ones(1), jnp.zeros(1)), (0.0, 1.0, 0.1)
+        sol = dfx.diffeqsolve(pendulum(k), LEAPFROG, *args, y0, adjoint=adjoint)
+        return jnp.sum(sol.ys[0])
+
+    def value(deep, k, adjoint):
+        branch = lambda factor: lambda k: end(factor * k, adjoint)
+        return jax.lax.cond(deep, branch(1.0), branch(2.0), k)
+
+    slopes = jax.vmap(jax.grad(value, argnums=1), (0, None, None))
+    both = slopes(jnp.array([True, False]), 1.3, REVERSIBLE)
+    for deep, slope in zip((True, False), both, strict=True):
+        exact = jax.grad(value, argnums=1)(deep, 1.3, CHECKPOINTED)
+        np.testing.assert_allclose(slope, exact, rtol=1e-12)
+
+
+def test_an_equation_of_one_member_that_has_no_solution():
+    """The linear solve of the derivative of a root finder ends no other member."""
+    newton = optx.Newton(rtol=1e-10, atol=1e-10)
+
+    def loss(gamma):
+        sol = dfx.diffeqsolve(
+            pendulum(gamma),
+            *(dps.PresymplecticGauss(1, newton), 0.0, 1.0, 0.1),
+            (jnp.asarray(1.5), jnp.asarray(0.0)),
+            adjoint=REVERSIBLE,
+            throw=False,
+        )
+        assert sol.ys is not None
+        return jnp.sum(sol.ys[0])
+
+    good, bad = jax.vmap(jax.grad(loss))(jnp.array([0.2, jnp.nan]))
+    np.testing.assert_allclose(good, jax.grad(loss)(0.2), rtol=1e-9)
+    assert jnp.isnan(bad)
+
+
+def test_the_last_saved_time_where_steps_are_short():
+    # In a batch the last row computes a step too, which must not be one second long.
+    system = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), lambda t, q, args: 1e18 * jnp.sum(q**4)
+    )
+    ts = jnp.linspace(0.0, 1e-8, 8)
+
+    def saved(q):
+        y0 = q[None], jnp.zeros(1)
+        options = {"saveat": dfx.SaveAt(ts=ts), "adjoint": dps.FixedStepAdjoint()}
+        solver = dps.BlanesMoanRKN4()
+        sol = dfx.diffeqsolve(system, solver, 0.0, 1e-8, 1e-10, y0, **options)
+        assert sol.ys is not None
+        return jnp.sum(sol.ys[0])
+
+    gradient = jax.vmap(jax.grad(saved))(jnp.array([0.5, 1.0]))
+    assert jnp.all(jnp.isfinite(gradient))

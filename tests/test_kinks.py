@@ -1,0 +1,134 @@
+# pyright: reportOptionalOperand=false, reportOptionalMemberAccess=false
+"""Forces with jumps and kinks: `choose_step` says so, and `StepsBetween` ends steps
+there."""
+
+import itertools
+from typing import Any
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+from choosing import choose, cosine, RKN6, solve_of, system_of, Y0
+from helpers import flat
+
+import diffrax_presym as dps
+
+
+RKN4 = dps.BlanesMoanRKN4()
+KNOTS, PUSH = np.array([0.0, 1.3, 4.0, 7.7, 10.0]), np.array([0.0, 2.0, -1.0, 1.5, 0.0])
+
+
+# A force of -1 that jumps to +1: whether a step sees it early or late is chance.
+
+
+def after_a_jump(a):
+    """The state at the time 2, from one and 0.3."""
+    b = 2 - a
+    return np.array([1.6 - a**2 / 2 - a * b + b**2 / 2, 0.3 - a + b])
+
+
+def check_jumps(solver, jumps):
+    system = system_of(lambda t, q, a: jnp.sum(q) * jnp.where(t < a, 1.0, -1.0), 0.0)
+
+    @jax.jit
+    def solve(dt0, a):
+        y0 = jnp.array([1.0]), jnp.array([0.3])
+        options: dict[str, Any] = {"adjoint": dps.FixedStepAdjoint(), "max_steps": None}
+        return dfx.diffeqsolve(system, solver, 0.0, 2.0, dt0, y0, a, **options)
+
+    for a, tolerance in itertools.product(jumps, (1e-3, 1e-4, 1e-5)):
+        at = lambda h, a=a: solve(h, a)
+        try:
+            step = dps.choose_step(at, 0.0, 2.0, rtol=tolerance, atol=tolerance)
+        except RuntimeError as error:
+            assert "no regular convergence" in str(error) or "needs" in str(error)
+            continue
+        exact = after_a_jump(a)
+        error = np.abs(flat(solve(step.dt0, a).ys) - exact)
+        if np.max(error / (1 + np.abs(exact))) > 2 * tolerance:
+            assert not step.smooth and "StepsBetween" in str(step)
+
+
+JUMPS = np.random.default_rng(7).uniform(0.05, 1.95, 100)
+
+
+@pytest.mark.parametrize(
+    "solver, jumps",
+    [
+        (dps.PresymplecticLeapfrog(), [0.9953608518777141, *JUMPS[:8]]),
+        (RKN6, [1.3071239464485345, 0.777, *JUMPS[:8]]),
+    ],
+)
+def test_jumps_inside_of_a_step_have_a_note(solver, jumps):
+    check_jumps(solver, jumps)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "solver",
+    [
+        dps.Strang(),
+        dps.PresymplecticLeapfrog(),
+        dps.BlanesMoanRKN4(),
+        RKN6,
+        dps.BlanesCasasRKN8(),
+    ],
+)
+def test_many_jumps_have_a_note(solver):
+    check_jumps(solver, JUMPS)
+
+
+# `StepsBetween`, with a force from a table.
+
+TABLE = system_of(
+    lambda t, q, push: cosine(t, q, None) - jnp.interp(t, KNOTS, push) * jnp.sum(q)
+)
+BETWEEN = {"stepsize_controller": dps.StepsBetween(KNOTS[::-1])}
+
+
+def by_scipy(t0, t1, y):
+    """The state at `t1`, from knot to knot."""
+
+    def rhs(t, y):
+        q, p = np.split(y, 2)
+        return np.append(p, np.interp(t, KNOTS, PUSH) - np.sin(q) - 0.1 * p)
+
+    inner = [t for t in KNOTS if min(t0, t1) < t < max(t0, t1)]
+    for span in itertools.pairwise([t0, *(inner if t0 < t1 else inner[::-1]), t1]):
+        sol = scipy.integrate.solve_ivp(rhs, span, y, "DOP853", rtol=1e-13, atol=1e-13)
+        y = sol.y[:, -1]
+    return y
+
+
+@pytest.mark.parametrize("adjoint", [dps.FixedStepAdjoint(), dfx.DirectAdjoint()])
+@pytest.mark.parametrize("t0, t1", [(0.5, 9.0), (9.0, 0.5)])
+def test_steps_between_kinks_keep_the_order(adjoint, t0, t1):
+    options = {"args": jnp.asarray(PUSH), "adjoint": adjoint} | BETWEEN
+    solve = solve_of(TABLE, RKN4, t0, t1, Y0, **options)
+    exact = by_scipy(t0, t1, np.concatenate(Y0))
+    sols = [solve(h if t0 < t1 else -h) for h in (0.2, 0.05)]
+    ends = [np.concatenate([y[-1] for y in sol.ys]) for sol in sols]
+    errors = [np.max(np.abs(end - exact)) for end in ends]
+    assert errors[1] < 1e-7 and errors[0] / errors[1] > 4**3.5
+    # Four, 14, 19 and seven steps.
+    assert sols[0].stats["num_steps"] == 44
+
+
+@pytest.mark.slow
+def test_steps_between_kinks_are_chosen_and_differentiated():
+    options: dict[str, Any] = {"ts": jnp.array([2.0, 9.0])} | BETWEEN
+    problem = TABLE, RKN4, 0.0, 10.0, Y0, 1e-7
+    push = jnp.asarray(PUSH)
+    step = choose(*problem, args=push, **options)
+    assert step.order > 3.5 and "StepsBetween" not in str(step)
+
+    def end(push):
+        sol = solve_of(*problem[:-1], args=push, **options)(step.dt0)
+        return jnp.sum(sol.ys[0] ** 2)
+
+    along = jnp.array([0.3, -0.2, 0.5, 0.1, -0.4])
+    difference = (end(push + 1e-5 * along) - end(push - 1e-5 * along)) / 2e-5
+    assert jax.grad(end)(push) @ along == pytest.approx(float(difference), rel=1e-7)
