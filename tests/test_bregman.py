@@ -225,26 +225,6 @@ def test_a_step_backwards_undoes_a_step_of_a_splitting(mirror):
     assert_close(back, (Q, P), 1e-13)
 
 
-@pytest.mark.slow
-def test_quadratic_case_is_the_separable_one():
-    c, C = 3.0, 0.4
-    bregman = system(NAMED["euclidean"])
-    separable = dps.DissipativeHamiltonian(
-        dps.QuadraticKinetic(MASS / c),
-        lambda t, q, args: c * C * objective(t, q, args),
-        eta1=dps.LogDamping(c + 1),  # gamma - alpha
-        eta2=dps.LogDamping(2 * c - 1),  # alpha + beta + gamma
-    )
-    start = separable.from_canonical(T0, bregman.to_canonical(T0, P))
-    for solver in (dps.PresymplecticLeapfrog("position"), dps.BlanesMoanRKN4()):
-        _, q, p = trajectory(bregman, solver, T0, T0 + 2, 0.1, (Q, P))
-        t, q2, p2 = trajectory(separable, solver, T0, T0 + 2, 0.1, (Q, start))
-        assert_close(q, q2, 1e-13)
-        # With the log scales gamma and eta2.
-        momenta = jax.vmap(bregman.to_canonical)(t, p)
-        assert_close(momenta, jax.vmap(separable.to_canonical)(t, p2), 1e-13)
-
-
 def beyond_a_corner(t, q, args):
     return jnp.sum((q - jnp.array([[1.5, 0, -0.5]], q.dtype)) ** 2)
 

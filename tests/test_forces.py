@@ -302,19 +302,3 @@ def test_the_force_of_the_potential_is_evaluated_once_per_kick():
     ends(system, dps.BlanesMoan6(), 1.0, 10, Y0)
     jax.effects_barrier()
     assert len(count) == 100
-
-
-def test_refused():
-    """Schemes that would lose their order, or need other parts, name those that do
-    not."""
-    for solver, why in (
-        (dps.TunedRKN6(), "without a `force=f` of the velocity. Otherwise use `Strang"),
-        (dps.PresymplecticLeapfrog(), "`BlanesMoan4\\(\\)`, which are explicit"),
-        (dps.SymmetricMultistep(8), "use `TunedRKN6\\(\\)`, `BlanesMoan6\\(\\)`"),
-        (dps.TunedLinear8(), "`BlanesMoan6\\(\\)` or `PresymplecticGauss"),
-    ):
-        with pytest.raises(ValueError, match=why):
-            ends(RUBBED, solver, 1.0, 10, Y0, ARGS)
-    energy = dps.Hamiltonian(lambda t, q, p, args: p @ p / 2, force=tanh_friction)
-    with pytest.raises(ValueError, match="give its parts: `MechanicalSystem"):
-        ends(energy, dps.Strang(), 1.0, 10, Y0, ARGS)

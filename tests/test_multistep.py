@@ -1,7 +1,5 @@
-"""Symmetric multistep methods."""
+"""Symmetric multistep methods: history, rounding, stability and what is refused."""
 
-import pathlib
-import sys
 from typing import Any
 
 import diffrax as dfx
@@ -15,10 +13,8 @@ from helpers import assert_close, henon_heiles, pendulum, solve
 
 import diffrax_presym as dps
 from diffrax_presym._results import MULTISTEP_UNSTABLE, OTHER_HISTORY
-from diffrax_presym._scheme._multistep import _MOST_FRICTION, _TABLES
 
 
-ORDERS = tuple(_TABLES)
 FIXED = dps.FixedStepAdjoint()
 
 
@@ -47,48 +43,6 @@ def ends(*args, **options) -> Any:
 def largest(x, y):
     pairs = zip(*map(jax.device_get, map(jax.tree.leaves, (x, y))), strict=True)
     return max(float(np.max(np.abs(a - b))) for a, b in pairs)
-
-
-@pytest.mark.parametrize("order", ORDERS)
-def test_coefficients(order, monkeypatch):
-    # For x = t^k: sum alpha_j j^k = k (k - 1) sum beta_j j^(k - 2).
-    table = _TABLES[order]
-    alpha = np.convolve(table.kicks, [1, -2, 1])
-    beta = np.array([0, *table.forces, 0])
-    j = np.arange(order + 1) - order / 2
-    defects = [
-        abs(alpha @ j**k - k * (k - 1) * (beta @ j ** max(k - 2, 0))) / (order / 2) ** k
-        for k in range(order + 3)
-    ]
-    assert max(defects[:-1]) < 1e-11 < 1e-4 < defects[-1]
-    # All roots but the double one at 1 are simple and on the unit circle.
-    roots = np.roots(table.kicks)
-    assert np.allclose(np.abs(roots), 1, atol=1e-10)
-    assert np.min(np.abs(roots - 1)) > 0.1
-    assert np.min(np.abs(roots[:, None] - roots) + 2 * np.eye(order - 2)) > 0.02
-    # The script of the coefficients still finds them.
-    folder = pathlib.Path(__file__).parents[1] / "benchmarks"
-    monkeypatch.syspath_prepend(str(folder))
-    import multistep  # pyright: ignore[reportMissingImports]
-
-    assert table == multistep.method(multistep.from_cosines(multistep.COSINES[order]))
-    for name in ("multistep", "_report"):
-        sys.modules.pop(name)
-
-
-@pytest.mark.parametrize("order, rate", [(8, None), (8, -0.1), (10, None), (10, 0.2)])
-def test_order(order, rate):
-    hamiltonian, solver = system(rate), dps.SymmetricMultistep(order)
-    assert solver.order(None) == order
-    exact = ends(hamiltonian, EXACT, 1.0, 13.0, 0.05, Y0, ONE)
-    counts = (128, 200)
-    errors = [
-        largest(ends(hamiltonian, solver, 1.0, 13.0, 12 / n, Y0, ONE), exact)
-        for n in counts
-    ]
-    measured = np.log(errors[0] / errors[1]) / np.log(counts[1] / counts[0])
-    assert measured > order - 1
-    assert errors[0] < 1e-7 and errors[1] < 3e-9
 
 
 @pytest.mark.parametrize("wrap", [lambda x: x, dps.Compensated])
@@ -160,17 +114,6 @@ def test_what_one_step_does_not_show():
     args = 0.0, 0.1, Y0, ONE
     with pytest.raises(ValueError, match="not symplectic"):
         dps.diagnostics.structure_defect(system(0.1), dps.SymmetricMultistep(), *args)
-
-
-def test_backwards_in_time_and_any_mass():
-    mass = jnp.array([[2.0, 0.5], [0.5, 1.0]])
-    for kinetic in (dps.QuadraticKinetic(mass), dps.QuadraticKinetic(3.0)):
-        rate = dps.ConstantDamping(0.1)
-        hamiltonian = dps.MechanicalSystem(kinetic, henon_heiles, rate)
-        y0 = jax.tree.map(lambda x: x / 4, Y0)
-        args = hamiltonian, dps.SymmetricMultistep(8), 10.0, 4.0, -0.05, y0
-        exact = ends(hamiltonian, EXACT, *args[2:])
-        assert_close(ends(*args), exact, 1e-9)
 
 
 def test_one_evaluation_per_step():
@@ -319,7 +262,7 @@ def test_vmap():
         assert_close(jax.tree.map(lambda x, i=i: x[i], batch), one, 1e-13)
 
 
-@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("order", [8, 10])
 def test_energy_does_not_drift(order):
     """On an orbit of Kepler's problem."""
     potential = lambda t, q, args: -1 / jnp.sqrt(jnp.sum(q**2))
@@ -378,21 +321,6 @@ def test_a_force_that_passes_through_zero():
     term = dps.MechanicalSystem(dps.QuadraticKinetic(), pendulum, rate)
     ys = ends(term, dps.SymmetricMultistep(), 0.0, 100.0, 0.5, y0)
     assert_close(ys, ends(term, EXACT, 0.0, 100.0, 0.1, y0), 1e-3)
-
-
-def test_most_friction():
-    """The rate of the slow motion, from the largest root of the method."""
-    for order, most in _MOST_FRICTION.items():
-        table = _TABLES[order]
-        alpha = np.convolve(table.kicks, [1, -2, 1])
-        beta = np.array([0, *table.forces, 0])
-
-        def error(x, alpha=alpha, beta=beta):
-            root = np.max(np.abs(np.roots(alpha - (x**2 / 4 - 1e-4) * beta)))
-            rate = (x**2 / 4 - 1e-4) ** 0.5 - x / 2
-            return abs((np.log(root) - x / 2) / rate - 1)
-
-        assert error(most) < 0.1 < error(1.02 * most)
 
 
 def test_bad_input():

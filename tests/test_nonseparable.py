@@ -9,7 +9,6 @@ import numpy as np
 import optimistix as optx
 import pytest
 from helpers import flat, mixed_energy, solve, trajectory
-from jax.flatten_util import ravel_pytree
 from jax.test_util import check_grads
 
 import diffrax_presym as dps
@@ -47,34 +46,13 @@ def canonical_energy(t, q, P, args):
     return DAMPED.canonical(t, q, DAMPED.from_canonical(t, P))
 
 
-def test_damped_motion_stays_finite_and_conformal():
-    solver, dt0 = dps.PresymplecticTao(), 1 / 16
-    sol = solve(DAMPED, solver, 0.0, 1000.0, dt0, START, max_steps=None)
+def test_damped_motion_stays_finite():
+    sol = solve(
+        *(DAMPED, dps.PresymplecticTao(), 0.0, 1000.0, 1 / 16, START), max_steps=None
+    )
     assert sol.result == dfx.RESULTS.successful
     # At small amplitude the system is the oscillator, with the same decay.
     assert np.log(np.max(np.abs(flat(sol.ys)))) == pytest.approx(-25, abs=1.5)
-    n = 2
-
-    @jax.jit
-    def jacobian(x):
-        state, unravel = ravel_pytree((sol.ys, sol.ys))
-
-        def doubled(x):
-            (q, p), copy = unravel(x)
-            at = jnp.array(1000.0), q, copy[1]
-            carry = copy, (DAMPED.velocity(*at), DAMPED.force(*at))
-            y, _, _, carry, _ = solver.step(
-                DAMPED,
-                *(jnp.array(1000.0), jnp.array(1000.0 + dt0), (q, p), None),
-                *(carry, False),
-            )
-            return jnp.concatenate([flat(y), flat(jax.tree.leaves(carry)[:2])])
-
-        return jax.jacfwd(doubled)(state + x)
-
-    J = np.asarray(jacobian(jnp.zeros(4)))
-    form = np.kron(np.eye(n), [[0, 1], [-1, 0]])
-    assert np.max(np.abs(J.T @ form @ J - np.exp(-0.05 * dt0) * form)) < 1e-14
 
 
 def test_a_coupling_of_canonical_momenta_fails():
