@@ -1,121 +1,22 @@
-"""Shared by the tests: the list of schemes, some systems, and functions to run them."""
+"""Shared by the tests: some systems, and functions to run solves."""
 
-import dataclasses
 import json
 import pathlib
-from typing import Any, Literal
 
 import diffrax as dfx
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-import optimistix as optx
-import pytest
 from jax.flatten_util import ravel_pytree
 
 import diffrax_presym as dps
 from diffrax_presym.extend import System
 
 
-# The form of the energy that a scheme requires, i.e. the systems it is tested on.
-Kind = Literal[
-    "frozen",  # T(t, p) + V(t, q)
-    "split",  # a kinetic energy whose exact flow is known, and V(t, q)
-    "quadratic",  # a quadratic kinetic energy, and V(t, q)
-    "augmented",  # anything; the solver state holds a copy `(q, p)` in `carry[0]`
-]
-
-
-@dataclasses.dataclass(frozen=True)
-class Scheme:
-    """A solver and its claimed properties."""
-
-    name: str
-    solver: Any
-    order: int
-    evaluations: int  # of the force, per step
-    symmetric: bool = True
-    kind: Kind = "frozen"
-
-    def __repr__(self):
-        return self.name
-
-
 def substeps(base, n: int):
     """Several equal steps of a scheme as one."""
     return dps.Composition(base, (1 / n,) * n)
-
-
-# A new scheme is added as one line.
-SCHEMES = [
-    Scheme("euler_A", dps.PresymplecticEuler("momentum"), 1, 1, symmetric=False),
-    Scheme("euler_B", dps.PresymplecticEuler("position"), 1, 1, symmetric=False),
-    Scheme("leapfrog_AB", dps.PresymplecticLeapfrog("momentum"), 2, 1),
-    Scheme("leapfrog_BA", dps.PresymplecticLeapfrog("position"), 2, 1),
-    Scheme("suzuki_yoshida_4", dps.SuzukiYoshida(4), 4, 3),
-    Scheme(
-        "suzuki_yoshida_4_BA",
-        dps.SuzukiYoshida(4, dps.PresymplecticLeapfrog("position")),
-        4,
-        3,
-    ),
-    Scheme("suzuki_yoshida_6", dps.SuzukiYoshida(6), 6, 9),
-    Scheme("suzuki_yoshida_8", dps.SuzukiYoshida(8), 8, 27),
-    Scheme("substeps", substeps(dps.PresymplecticLeapfrog(), 3), 2, 3),
-    Scheme("strang", dps.Strang(), 2, 1, kind="split"),
-    Scheme("tao", dps.PresymplecticTao(), 2, 3, kind="augmented"),
-    Scheme("tao_fixed", dps.PresymplecticTao(5.0), 2, 3, kind="augmented"),
-    Scheme(
-        "tao_4", dps.SuzukiYoshida(4, dps.PresymplecticTao(5.0)), 4, 9, kind="augmented"
-    ),
-]
-# One scheme for each code path; the others differ only in their coefficients.
-WAYS = [
-    scheme
-    for scheme in SCHEMES
-    if scheme.name
-    in {
-        "euler_B",
-        "leapfrog_AB",
-        "leapfrog_BA",
-        "suzuki_yoshida_4",
-        "substeps",
-        "strang",
-        "tao_4",
-    }
-]
-# One scheme for each kind of solver state: none, a force, a copy. Diffrax does not
-# depend on anything else.
-CARRIES = [
-    scheme
-    for scheme in SCHEMES
-    if scheme.name in {"leapfrog_BA", "suzuki_yoshida_4", "tao_4"}
-]
-# Schemes that are explicit for any energy.
-ANY: tuple[Kind, ...] = ("augmented",)
-
-# An implicit scheme, for any energy.
-_midpoint = dps.PresymplecticGauss(1, optx.Newton(rtol=1e-12, atol=1e-12))
-IMPLICIT = [Scheme("midpoint", _midpoint, 2, 1)]
-
-
-def each(schemes=SCHEMES, *, kinds: tuple[Kind, ...] | None = None, symmetric=None):
-    """Parametrise a test over schemes; by default over all of them."""
-    chosen = [
-        scheme
-        for scheme in schemes
-        if (kinds is None or scheme.kind in kinds)
-        and (symmetric is None or scheme.symmetric == symmetric)
-    ]
-    return pytest.mark.parametrize("scheme", chosen, ids=repr)
-
-
-def few(cases, schemes):
-    """All cases for each kind of solver state; the first case for other schemes."""
-    first, *_ = cases
-    chosen = [(s, c) for s in schemes for c in cases if s in CARRIES or c == first]
-    return pytest.mark.parametrize("scheme, case", chosen, ids=repr)
 
 
 def reference(name: str):
