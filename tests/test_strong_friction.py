@@ -113,6 +113,18 @@ def test_one_strongly_damped_entry_among_ordinary_ones(adjoint):
     assert_close(sol.ys[0][-1, 1], jnp.exp(-10 / 100), 1e-2)
 
 
+@each_loop
+@pytest.mark.parametrize("solver", [dps.BlanesMoan6(), dps.Suzuki4()])
+def test_friction_that_changes_its_sign_within_a_step(solver, adjoint):
+    """Of a step it is none, but stages that go back in time amplify rounding errors."""
+    system = damped(lambda t: 20 * jnp.sin(2 * jnp.pi * t))
+    run = lambda h: solve(
+        *(system, solver, 0.0, 4.0, h, REST), adjoint=adjoint, throw=False
+    )
+    assert run(1.0).result != dfx.RESULTS.successful
+    assert run(1 / 256).result == dfx.RESULTS.successful
+
+
 def test_gradient_under_friction_that_is_too_strong():
     """It is not finite, as the solution is not, rather than zero."""
 
