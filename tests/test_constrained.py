@@ -270,6 +270,14 @@ def test_the_diagonals_of_a_chain_are_its_matrix(n):
     np.testing.assert_allclose(other, value, rtol=1e-11)
 
 
+@pytest.mark.parametrize("n", [2, 5, 17])
+def test_multipliers_by_pivots(n):
+    """Of matrices with zeros on the diagonal, as of Newton's method for long steps."""
+    matrix = np.random.default_rng(n).standard_normal((n, n)) * (1 - np.eye(n))
+    solution = _multipliers.solve(lambda x: matrix @ x, jnp.arange(1.0, n + 1), None)
+    np.testing.assert_allclose(matrix @ solution, np.arange(1.0, n + 1), atol=1e-11)
+
+
 def test_a_linear_system_that_is_not_solved_is_one_member_of_a_batch():
     """NaN in derivatives too, where Lineax itself raises an error for all."""
     solver = lx.GMRES(1e-12, 1e-12, max_steps=4, restart=2)
