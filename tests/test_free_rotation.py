@@ -24,6 +24,7 @@ BODIES = {
     "symmetric, flat": ([1.0, 1.0, 1.9], [0.7, -0.4, 1.1]),
     "symmetric, long": ([1.0, 0.1, 1.0], [0.7, -0.04, 0.2]),
     "nearly symmetric": ([1.0, 1.0 + 1e-12, 1.9], [0.7, -0.4, 1.1]),
+    "a rod": ([0.01, 1.0, 1.0], [0.01, 0.3, 0.0]),
     "spherical": ([0.8, 0.8, 0.8], [0.7, -0.4, 1.1]),
     "nearly at rest": ([1.0, 1.6, 2.3], [1e-7, -2e-7, 1e-7]),
     "at rest": ([1.0, 1.6, 2.3], [0.0, 0.0, 0.0]),
@@ -78,9 +79,9 @@ def test_derivatives(body, s):
     inertia, p = map(np.array, BODIES[body])
 
     def difference(fn, x, i):
-        step = 1e-4 * np.eye(len(x))[i]
-        near = (fn(x + step) - fn(x - step)) / (2e-4)
-        far = (fn(x + 2 * step) - fn(x - 2 * step)) / (4e-4)
+        step = 1e-5 * np.eye(len(x))[i]
+        near = (fn(x + step) - fn(x - step)) / 2e-5
+        far = (fn(x + 2 * step) - fn(x - 2 * step)) / 4e-5
         return (4 * near - far) / 3
 
     by_p = lambda p: flow(inertia, state(p), s)
@@ -95,6 +96,19 @@ def test_derivatives(body, s):
     body = dps.Attitude(inertia)
     np.testing.assert_allclose(by_time[:4], body.velocity(q, p), atol=1e-11)
     np.testing.assert_allclose(by_time[4:], jnp.cross(p, p / inertia), atol=1e-11)
+
+
+@pytest.mark.parametrize("body", ["asymmetric", "a rod", "symmetric, long"])
+def test_long_steps_are_right_or_fail(body):
+    inertia, p = map(np.array, BODIES[body])
+    failed = []
+    for s in (1.5, 2.0, 2.5, 3.0, 4.0, 6.0, 10.0):
+        found = flow(inertia, state(p), s)
+        failed.append(bool(np.isnan(found[0])))
+        if not failed[-1]:
+            np.testing.assert_allclose(found, euler(inertia, p, s), atol=1e-8)
+    assert failed == sorted(failed) and not failed[0]
+    assert failed[-1] or body == "asymmetric"
 
 
 @pytest.mark.parametrize("s", [10.0, 40.0])
@@ -112,4 +126,8 @@ def test_many_bodies_in_single_precision():
     found = dps.Attitude(inertia).flow(q, jnp.asarray(p), jnp.float32(0.2))
     exact = np.stack([euler(*x, 0.2) for x in zip(inertia, p, strict=True)])
     assert found[0].dtype == found[1].dtype == jnp.float32
+    for scale in (1e12, 1e-12):  # The units are of no importance.
+        y = q, jnp.asarray(single(scale * p))
+        other = dps.Attitude(single(scale * inertia)).flow(*y, jnp.float32(0.2))
+        np.testing.assert_allclose(other[0], found[0], atol=1e-6)
     np.testing.assert_allclose(np.concatenate(found, axis=1), exact, atol=2e-6)

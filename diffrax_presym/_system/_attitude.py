@@ -16,9 +16,10 @@ class Attitude(AbstractManifold):
     real part first. Its momentum is the angular momentum along the principal axes of
     the body, three numbers.
 
-    The free rotation is by Jacobi's elliptic functions, and one integral by quadrature:
-    right to rounding while the body turns by two radians in a step. A potential takes
-    the matrix, `rotation_matrix(q)`.
+    The free rotation is by Jacobi's elliptic functions, and one integral by quadrature.
+    In a step in which the momentum turns by an angle, relative to the body, its error
+    is that of rounding for 1.5 radians, 1e-11 for 2 and 1e-8 for 3; beyond half of a
+    circle the solve fails. A potential takes the matrix, `rotation_matrix(q)`.
 
     ??? cite "Reference"
 

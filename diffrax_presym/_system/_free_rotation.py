@@ -30,7 +30,7 @@ Three = tuple[Array, Array, Array]  # the entries along the principal axes
 # The functions are doubled so often. At a 64th of the time the series has converged.
 _DOUBLINGS = 6
 # Where the rate of the angle is known, in units of the step, and its end.
-_NODES, _WEIGHTS = (x / 2 for x in np.polynomial.legendre.leggauss(6))
+_NODES, _WEIGHTS = (x / 2 for x in np.polynomial.legendre.leggauss(7))
 _TIMES = np.append(0.5 + _NODES, 1.0)
 
 
@@ -114,58 +114,81 @@ def _momentum(p: Three, rates: Three, s: Array) -> Three:
     return _each(jnp.add, p, _turned(change, is_third, is_first))
 
 
+def _product(x: tuple[Array, Three], y: tuple[Array, Three]) -> tuple[Array, Three]:
+    (a, u), (b, v) = x, y
+    vector = lambda u, v, w: a * v + b * u + w
+    return a * b - _dot(u, v), _each(vector, u, v, _cross(u, v))
+
+
 def _is_small(p: Vectors, rates: Vectors, s: Array) -> Bool[Array, "..."]:
     limit = float(jnp.finfo(p.dtype).eps) ** (2 / 3)
     return jnp.sum(p**2, axis=-1) * (s * jnp.max(rates, axis=-1)) ** 2 <= limit
 
 
 def _rotation(p: Vectors, rates: Vectors, s: Array) -> tuple[Quaternions, Vectors]:
-    # The rotation takes the momentum at the end to that at the start: the shortest one
-    # does, and then one about it by an angle, which is an integral. A small one is that
-    # by the mean velocity, as neither is defined for a body at rest.
+    # Through the momentum in the middle: from that at the end to it, by an angle about
+    # it, and on to that at the start, each of the first and the last by the shortest
+    # rotation. The angle is an integral. A small rotation is that by the mean velocity,
+    # as these are not defined for a body at rest.
     is_small = _is_small(p, rates, s)
     start, each = _entries(p), _entries(rates)
+    momentum = lambda x: _momentum(start, each, x * s)
+    later = jax.vmap(momentum)(cast_to(_TIMES, p))
+    middle, end = (_each(lambda x, i=i: x[i], later) for i in (len(_NODES) // 2, -1))
 
-    def after(x: Array) -> tuple[Three, Array, Array]:
-        """The momentum, its product with both, and the rate of the angle."""
-        later = _momentum(start, each, x * s)
-        both = _each(jnp.add, start, later)
-        product = jnp.where(is_small, 1, _dot(start, both))
-        return later, product, _dot(both, _each(jnp.multiply, later, each)) / product
+    def rate(later: Three) -> tuple[Array, Array]:
+        """Of the angle, and by how much the momentum turns, squared."""
+        velocity = _each(jnp.multiply, later, each)
+        both, turning = _each(jnp.add, middle, later), _cross(later, velocity)
+        product = jnp.where(is_small, 1, _dot(middle, both))
+        square = jnp.where(is_small, 1, _dot(middle, middle))
+        return _dot(both, velocity) / product, _dot(turning, turning) / square
 
-    later, product, rate = jax.vmap(after)(cast_to(_TIMES, p))
-    end = _each(lambda x: x[-1], later)
-    mean = jnp.tensordot(cast_to(_WEIGHTS, p), rate[:-1], 1)
+    rates_at, turned = jax.vmap(rate)(later)
+    mean = jnp.tensordot(cast_to(_WEIGHTS, p), rates_at[:-1], 1)
+    too_far = s**2 * jnp.max(turned, axis=0) > np.pi**2
 
-    def about(a: Array, b: Array, w: Array) -> Array:
-        return s / 2 * jnp.where(is_small, (a + b) / 2 * w, a * mean)
+    def about(a: Array, b: Array, c: Array, w: Array) -> Array:
+        return s / 2 * jnp.where(is_small, (a + b) / 2 * w, c * mean)
 
-    half = _each(about, start, end, each)
+    half = _each(about, start, end, middle, each)
     angle = jnp.sqrt(_dot(half, half))
-    real, turn = jnp.cos(angle), _each(lambda x: x * sinc(angle), half)
-    cosine = jnp.where(is_small, 1, product[-1])
-    axis = _each(lambda x: jnp.where(is_small, 0, x), _cross(end, start))
-    scale = 1 / jnp.sqrt(cosine**2 + _dot(axis, axis))
+    turn = jnp.cos(angle), _each(lambda x: x * sinc(angle), half)
 
-    def imaginary(a: Array, b: Array, c: Array) -> Array:
-        return scale * (real * a + cosine * b + c)
+    def shortest(x: Three, y: Three) -> tuple[Array, Three]:
+        real = jnp.where(is_small, 1, _dot(middle, _each(jnp.add, x, y)))
+        axis = _each(lambda x: jnp.where(is_small, 0, x), _cross(x, y))
+        scale = 1 / jnp.sqrt(real**2 + _dot(axis, axis))
+        return real * scale, _each(lambda x: x * scale, axis)
 
-    vector = _each(imaginary, axis, turn, _cross(turn, axis))
-    real = scale * (real * cosine - _dot(turn, axis))
-    return jnp.stack([real, *vector], axis=-1), jnp.stack(end, axis=-1)
+    turn = _product(shortest(middle, start), _product(turn, shortest(end, middle)))
+    real, vector = turn
+    turn = jnp.stack([real, *vector], axis=-1)
+    turn = jnp.where(too_far[..., None], jnp.nan, turn)
+    return turn, jnp.stack(end, axis=-1)
 
 
-@eqx.filter_custom_jvp
 def free_rotation(p: Vectors, rates: Vectors, s: Array) -> tuple[Quaternions, Vectors]:
     """The rotation of bodies over a time `s`, from their axes at the end to those at
     the start, and the angular momenta along the axes at the end. `rates` are the
-    inverses of the moments of inertia."""
+    inverses of the moments of inertia. Not a number if a momentum turns by more than
+    half of a circle, relative to the body."""
+    unit = lax.stop_gradient(jnp.max(jnp.abs(p), axis=-1, keepdims=True))
+    unit = jnp.where(unit > 0, unit, 1)
+    turn, end = _scaled_rotation(p / unit, rates * unit, s)
+    return turn, end * unit
+
+
+@eqx.filter_custom_jvp
+def _scaled_rotation(
+    p: Vectors, rates: Vectors, s: Array
+) -> tuple[Quaternions, Vectors]:
     # Or XLA on a CPU computes it again for each use of an entry.
     return lax.optimization_barrier(_rotation(p, rates, s))
 
 
-@free_rotation.def_jvp
-def _free_rotation_jvp(primals, tangents):
+@_scaled_rotation.def_jvp
+def _scaled_rotation_jvp(primals, tangents):
     """From the derivative of the momentum alone. The angular momentum in space is that
     at the start, and the derivative of the action is the change of the rotation along
     the momentum."""
@@ -174,7 +197,7 @@ def _free_rotation_jvp(primals, tangents):
         jnp.zeros_like(x) if dx is None else dx
         for x, dx in zip(primals, tangents, strict=True)
     )
-    turn, end = free_rotation(p, rates, s)
+    turn, end = _scaled_rotation(p, rates, s)
 
     def momentum(p: Vectors, rates: Vectors, s: Array) -> Vectors:
         return jnp.stack(_momentum(_entries(p), _entries(rates), s), axis=-1)
