@@ -274,7 +274,9 @@ def test_the_diagonals_of_a_chain_are_its_matrix(n):
 def test_multipliers_by_pivots(n):
     """Of matrices with zeros on the diagonal, as of Newton's method for long steps."""
     matrix = np.random.default_rng(n).standard_normal((n, n)) * (1 - np.eye(n))
-    solution = _multipliers.solve(lambda x: matrix @ x, jnp.arange(1.0, n + 1), None)
+    solution = _multipliers.solve(
+        lambda x: jnp.asarray(matrix) @ x, jnp.arange(1.0, n + 1), None
+    )
     np.testing.assert_allclose(matrix @ solution, np.arange(1.0, n + 1), atol=1e-11)
 
 
