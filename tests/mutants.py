@@ -155,7 +155,7 @@ MUTANTS = [
         tests="test_between_steps.py", only="copies"),
     Mutant("a coefficient of the elliptic functions", "_system/_free_rotation.py",
         "square * (1 / 10", "square * (1 / 11", tests="test_free_rotation.py",
-        only="beside"),
+        only="periods"),
     Mutant("the derivative of a small rotation without its commutator",
         "_system/_free_rotation.py", "dangle / 2 - jnp.cross(angle, dangle) / 4",
         "dangle / 2", tests="test_free_rotation.py", only="derivatives"),
