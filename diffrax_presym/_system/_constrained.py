@@ -140,7 +140,7 @@ class ConstrainedSystem(AbstractSystem):
     def splits(self) -> tuple[AbstractSplit, ...]:
         (split, *_) = self.system.splits
         assert isinstance(split, AbstractForceSplit)
-        return (ConstrainedSplit(split, self.check_inverse),)
+        return (ConstrainedSplit(split),)
 
     def value(self, t: Time, q: Q, args: PyTree) -> Multipliers:
         """The constraints, as a vector."""

@@ -38,7 +38,6 @@ class ConstrainedSplit(AbstractSplit):
     """
 
     base: AbstractForceSplit
-    check_inverse: bool = eqx.field(static=True)
     kinds: ClassVar[frozenset[str]] = frozenset({"any"})
 
     @property
@@ -56,7 +55,7 @@ class ConstrainedSplit(AbstractSplit):
         free, h = _free(system), lengths(order, h)
         starts = t + jnp.cumsum(h) - h
         prepare = jax.vmap(lambda t, h: self.base.prepare(free, t, h, _ORDER))
-        back = prepare(starts + h, -h) if self.check_inverse else None
+        back = prepare(starts + h, -h) if system.term.check_inverse else None
         return h, prepare(starts, h), back
 
     def drift(self, system, t, h, data, y) -> State:
@@ -68,7 +67,7 @@ class ConstrainedSplit(AbstractSplit):
             start = tree.values(y[0])
             y, found = self._stage(system, t, h, data, y)
             failure = dfx.RESULTS.where(found, SUCCESSFUL, CONSTRAINT_NOT_SOLVED)
-            if self.check_inverse:
+            if system.term.check_inverse:
                 values = lax.stop_gradient(tree.values(y))
                 (end, _), found = self._stage(system, t + h, -h, back, values)
                 miss, unit = tree.largest(tree.sub(end, start)), tree.largest(end)
@@ -99,7 +98,7 @@ class ConstrainedSplit(AbstractSplit):
         miss = lambda x: term.value(t + h, tree.values(moved(x)[0]), args)
         x, found = find_root(miss, like, small, term.linear_solver)
         y = moved(x)
-        if self.base.kick_by != "force" or self.check_inverse:
+        if self.base.kick_by != "force" or term.check_inverse:
             y = self._tangential(system, t + h, y)
         return y, found
 

@@ -35,9 +35,9 @@ _TIMES = np.append(0.5 + _NODES, 1.0)
 
 
 def multiply(x: Quaternions, y: Quaternions) -> Quaternions:
-    a, b, u, v = x[..., :1], y[..., :1], x[..., 1:], y[..., 1:]
-    vector = a * v + b * u + jnp.cross(u, v)
-    return jnp.concatenate([a * b - inner(u, v), vector], axis=-1)
+    return _stacked(
+        *_product((x[..., 0], _entries(x[..., 1:])), (y[..., 0], _entries(y[..., 1:])))
+    )
 
 
 def _turned_back(q: Quaternions, x: Vectors) -> Vectors:
@@ -69,7 +69,17 @@ def _cross(x: Three, y: Three) -> Three:
     return b * w - c * v, c * u - a * w, a * v - b * u
 
 
-def _turned(x: Three, first: Array, third: Array) -> Three:
+def _product(x: tuple[Array, Three], y: tuple[Array, Three]) -> tuple[Array, Three]:
+    (a, u), (b, v) = x, y
+    vector = lambda u, v, w: a * v + b * u + w
+    return a * b - _dot(u, v), _each(vector, u, v, _cross(u, v))
+
+
+def _stacked(real: Array, vector: Three) -> Quaternions:
+    return jnp.stack([real, *vector], axis=-1)
+
+
+def _cycled(x: Three, first: Array, third: Array) -> Three:
     """The axes in cyclic order, so that the first or the third becomes the second."""
     a, b, c = x
     choose = lambda a, b, c: jnp.where(first, b, jnp.where(third, c, a))
@@ -99,8 +109,8 @@ def _momentum(p: Three, rates: Three, s: Array) -> Three:
     is_second = (v - u) * (v - w) <= 0
     is_first = ~is_second & ((u - v) * (u - w) <= 0)
     is_third = ~(is_second | is_first)
-    u, v, w = _turned(rates, is_first, is_third)
-    x, y, z = _turned(p, is_first, is_third)
+    u, v, w = _cycled(rates, is_first, is_third)
+    x, y, z = _cycled(p, is_first, is_third)
     # Euler's equations: x' = a y z, y' = b z x, z' = c x y, with a c >= 0.
     a, b, c = w - v, u - w, v - u
     both = a * c * y**2
@@ -111,13 +121,7 @@ def _momentum(p: Three, rates: Three, s: Array) -> Three:
         (y * (shift - C - D + C * D) + b * z * x * S) * scale,
         (z * (shift - D) + c * x * y * S * (1 - C)) * scale,
     )
-    return _each(jnp.add, p, _turned(change, is_third, is_first))
-
-
-def _product(x: tuple[Array, Three], y: tuple[Array, Three]) -> tuple[Array, Three]:
-    (a, u), (b, v) = x, y
-    vector = lambda u, v, w: a * v + b * u + w
-    return a * b - _dot(u, v), _each(vector, u, v, _cross(u, v))
+    return _each(jnp.add, p, _cycled(change, is_third, is_first))
 
 
 def _is_small(p: Vectors, rates: Vectors, s: Array) -> Bool[Array, "..."]:
@@ -125,6 +129,7 @@ def _is_small(p: Vectors, rates: Vectors, s: Array) -> Bool[Array, "..."]:
     return jnp.sum(p**2, axis=-1) * (s * jnp.max(rates, axis=-1)) ** 2 <= limit
 
 
+@eqx.filter_custom_jvp
 def _rotation(p: Vectors, rates: Vectors, s: Array) -> tuple[Quaternions, Vectors]:
     # Through the momentum in the middle: from that at the end to it, by an angle about
     # it, and on to that at the start, each of the first and the last by the shortest
@@ -162,33 +167,13 @@ def _rotation(p: Vectors, rates: Vectors, s: Array) -> tuple[Quaternions, Vector
         return real * scale, _each(lambda x: x * scale, axis)
 
     turn = _product(shortest(middle, start), _product(turn, shortest(end, middle)))
-    real, vector = turn
-    turn = jnp.stack([real, *vector], axis=-1)
-    turn = jnp.where(too_far[..., None], jnp.nan, turn)
-    return turn, jnp.stack(end, axis=-1)
+    turn = jnp.where(too_far[..., None], jnp.nan, _stacked(*turn))
+    # Or XLA on a CPU computes them again for each use of an entry.
+    return lax.optimization_barrier((turn, jnp.stack(end, axis=-1)))
 
 
-def free_rotation(p: Vectors, rates: Vectors, s: Array) -> tuple[Quaternions, Vectors]:
-    """The rotation of bodies over a time `s`, from their axes at the end to those at
-    the start, and the angular momenta along the axes at the end. `rates` are the
-    inverses of the moments of inertia. Not a number if a momentum turns by more than
-    half of a circle, relative to the body."""
-    unit = lax.stop_gradient(jnp.max(jnp.abs(p), axis=-1, keepdims=True))
-    unit = jnp.where(unit > 0, unit, 1)
-    turn, end = _scaled_rotation(p / unit, rates * unit, s)
-    return turn, end * unit
-
-
-@eqx.filter_custom_jvp
-def _scaled_rotation(
-    p: Vectors, rates: Vectors, s: Array
-) -> tuple[Quaternions, Vectors]:
-    # Or XLA on a CPU computes it again for each use of an entry.
-    return lax.optimization_barrier(_rotation(p, rates, s))
-
-
-@_scaled_rotation.def_jvp
-def _scaled_rotation_jvp(primals, tangents):
+@_rotation.def_jvp
+def _rotation_jvp(primals, tangents):
     """From the derivative of the momentum alone. The angular momentum in space is that
     at the start, and the derivative of the action is the change of the rotation along
     the momentum."""
@@ -197,7 +182,7 @@ def _scaled_rotation_jvp(primals, tangents):
         jnp.zeros_like(x) if dx is None else dx
         for x, dx in zip(primals, tangents, strict=True)
     )
-    turn, end = _scaled_rotation(p, rates, s)
+    turn, end = _rotation(p, rates, s)
 
     def momentum(p: Vectors, rates: Vectors, s: Array) -> Vectors:
         return jnp.stack(_momentum(_entries(p), _entries(rates), s), axis=-1)
@@ -218,3 +203,14 @@ def _scaled_rotation_jvp(primals, tangents):
     theta = jnp.where(is_small, small, (along + jnp.cross(end, change)) / square)
     half = jnp.concatenate([jnp.zeros_like(theta[..., :1]), theta / 2], axis=-1)
     return (turn, end), lax.optimization_barrier((multiply(turn, half), dend))
+
+
+def free_rotation(p: Vectors, rates: Vectors, s: Array) -> tuple[Quaternions, Vectors]:
+    """The rotation of bodies over a time `s`, from their axes at the end to those at
+    the start, and the angular momenta along the axes at the end. `rates` are the
+    inverses of the moments of inertia. Not a number if a momentum turns by more than
+    half of a circle, relative to the body."""
+    unit = lax.stop_gradient(jnp.max(jnp.abs(p), axis=-1, keepdims=True))
+    unit = jnp.where(unit > 0, unit, 1)
+    turn, end = _rotation(p / unit, rates * unit, s)
+    return turn, end * unit

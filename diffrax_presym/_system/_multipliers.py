@@ -60,8 +60,7 @@ def _eliminate(linear: LinearMap, b: Multipliers) -> Multipliers:
     matrix, row = _matrix(linear, b), jnp.arange(b.size)
 
     def step(k: Array, x: Array) -> Array:
-        column = lax.dynamic_index_in_dim(x, k, 1, keepdims=False)
-        size = jnp.where(row < k, -1, jnp.abs(column))
+        size = jnp.where(row < k, -1, jnp.abs(x[:, k]))
         chosen, old = (row == jnp.argmax(size))[:, None], x[k]
         pivot = jnp.sum(jnp.where(chosen, x, 0), axis=0)
         x = jnp.where(chosen, old[None], x)
