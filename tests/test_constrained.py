@@ -1,5 +1,5 @@
 """Constraints: orders and gradients with any friction, against SciPy on the equations
-with multipliers, or in coordinates that need none."""
+with multipliers."""
 
 from functools import cache, partial
 from typing import Any
@@ -8,13 +8,11 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 import pytest
-import scipy.integrate
+from on_manifolds import by_scipy, end_as_vector as end
 
 import diffrax_presym as dps
-from diffrax_presym._system import _multipliers
 
 
 diffeqsolve: Any = dfx.diffeqsolve
@@ -87,19 +85,6 @@ def exact(friction):
     return by_scipy(field, y0, 2.0)
 
 
-def by_scipy(field, y0, t1):
-    options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-13}
-    return scipy.integrate.solve_ivp(field, (0, t1), y0, **options).y[:, -1]
-
-
-def end(system, solver, y0, t1, steps, **options):
-    """The final state, as one vector."""
-    options = {"adjoint": dps.FixedStepAdjoint(), "max_steps": None} | options
-    args = (system, solver, 0.0, t1, t1 / steps, y0)
-    ys = jax.jit(lambda: diffeqsolve(*args, **options).ys)()
-    return np.concatenate([np.ravel(y[-1]) for y in ys])
-
-
 def order(errors):
     """The slope over the steps whose errors are above rounding."""
     errors = [e for e in errors if e > 2e-12]
@@ -138,161 +123,6 @@ def test_a_step_is_undone(friction, scheme):
     y2, *_ = step(0.1, 0.0, y=y1, carry=carry)
     for x, y in zip(y0, y2, strict=True):
         np.testing.assert_allclose(y, x, atol=4e-15)
-
-
-STEPS = [10_000, pytest.param(1_000_000, marks=pytest.mark.slow)]
-
-
-@pytest.mark.parametrize("steps", STEPS)
-def test_constraints_hold_to_rounding(steps):
-    free = dps.MechanicalSystem(
-        dps.QuadraticKinetic(), lambda t, q, args: G * jnp.sum(q[:, 1])
-    )
-    system = dps.ConstrainedSystem(free, two_rods)
-    y0 = bobs(np.array([2.0, 2.5])), jnp.zeros((2, 2))
-    worst = lambda t, y, args: (system.violation(t, *y), system.energy(t, *y))
-    violation, energy = diffeqsolve(
-        *(system, dps.Strang(), 0.0, steps * 1e-3, 1e-3, y0),
-        saveat=dfx.SaveAt(ts=jnp.linspace(0.0, steps * 1e-3, 1001), fn=worst),
-        adjoint=dps.FixedStepAdjoint(),
-        max_steps=None,
-    ).ys
-    assert np.max(violation) < 1e-13
-    assert np.max(np.abs(energy - energy[0])) < 1e-2
-
-
-# Systems in coordinates that need no constraint.
-
-
-def test_spherical_pendulum_beside_its_angles():
-    gamma = 0.3
-    free = dps.MechanicalSystem(
-        *(dps.QuadraticKinetic(2.0), lambda t, q, args: 2 * G * q[2]),
-        dps.ConstantDamping(gamma),
-    )
-    system = dps.ConstrainedSystem(free, lambda t, q, args: q @ q - 1)
-
-    def field(t, y):  # from the lowest point, and around
-        theta, _, dtheta, dphi = y
-        s, c = np.sin(theta), np.cos(theta)
-        return np.array(
-            [
-                *(dtheta, dphi, s * c * dphi**2 - G * s - gamma * dtheta),
-                -2 * c / s * dtheta * dphi - gamma * dphi,
-            ]
-        )
-
-    def cartesian(y):
-        (s, t), (c, d), (dtheta, dphi) = np.sin(y[:2]), np.cos(y[:2]), y[2:]
-        q = np.array([s * d, s * t, -c])
-        v = dtheta * np.array([c * d, c * t, s]) + dphi * np.array([-s * t, s * d, 0])
-        return np.concatenate([q, 2 * v])
-
-    first = np.array([1.2, 0.3, 0.4, 1.5])
-    y0 = tuple(map(jnp.asarray, np.split(cartesian(first), 2)))
-    y = end(system, dps.SofroniouSpaletta(6, dps.Strang()), y0, 3.0, 150)
-    np.testing.assert_allclose(y, cartesian(by_scipy(field, first, 3.0)), atol=1e-11)
-
-
-def test_bead_on_a_turning_wire():
-    omega = 1.3
-    free = dps.MechanicalSystem(dps.QuadraticKinetic(), lambda t, q, args: 0.0 * q[0])
-    wire = lambda t, q, args: jnp.cos(omega * t) * q[1] - jnp.sin(omega * t) * q[0]
-    system = dps.ConstrainedSystem(free, wire)
-    y0 = jnp.array([0.5, 0.0]), jnp.array([0.0, 0.5 * omega])
-    t = 2.0
-    y = end(system, dps.SofroniouSpaletta(6, dps.Strang()), y0, t, 40)
-    r, dr = 0.5 * np.cosh(omega * t), 0.5 * omega * np.sinh(omega * t)
-    along = np.array([np.cos(omega * t), np.sin(omega * t)])
-    across = omega * np.array([-along[1], along[0]])
-    wanted = np.concatenate([r * along, dr * along + r * across])
-    np.testing.assert_allclose(y, wanted, atol=1e-10)
-    assert system.violation(t, *map(jnp.asarray, np.split(y, 2))) < 5e-15
-
-
-def two_rods(t, q, args):
-    return jnp.stack([q[0] @ q[0], (q[1] - q[0]) @ (q[1] - q[0])]) - 1
-
-
-def bobs(angles):
-    rods = np.stack([np.sin(angles), -np.cos(angles)], axis=1)
-    return jnp.asarray(np.cumsum(rods, axis=0))
-
-
-def test_double_pendulum_beside_its_angles():
-    free = dps.MechanicalSystem(
-        dps.QuadraticKinetic(), lambda t, q, args: G * jnp.sum(q[:, 1])
-    )
-    system = dps.ConstrainedSystem(free, two_rods)
-
-    def field(t, y):
-        a, b, da, db = y
-        s, c = np.sin(a - b), np.cos(a - b)
-        force = [-s * db**2 - 2 * G * np.sin(a), s * da**2 - G * np.sin(b)]
-        return np.array([da, db, *np.linalg.solve([[2, c], [c, 1]], force)])
-
-    first = np.array([2.0, 2.5])
-    y0 = bobs(first), jnp.zeros((2, 2))
-    y = end(system, dps.SofroniouSpaletta(6, dps.Strang()), y0, 1.5, 200)
-    angles = by_scipy(field, np.array([*first, 0, 0]), 1.5)[:2]
-    np.testing.assert_allclose(y[:4], np.ravel(bobs(angles)), atol=1e-10)
-
-
-def links(t, q, args):
-    each = jnp.diff(jnp.concatenate([jnp.zeros((1, 2)), q]), axis=0)
-    return jnp.sum(each**2, axis=1) - 1
-
-
-@pytest.mark.variants(1)
-@pytest.mark.parametrize("n", [12, 1, 2])
-def test_the_diagonals_of_a_chain_are_its_matrix(n):
-    free = dps.MechanicalSystem(
-        *(dps.QuadraticKinetic(jnp.linspace(1.0, 2.0, n)[:, None]),),
-        *(lambda t, q, args: G * jnp.sum(q[:, 1]), dps.ConstantDamping(0.2)),
-    )
-    y0 = bobs(np.linspace(1.0, 1.5, n)), jnp.zeros((n, 2))
-
-    def loss(p, solver):
-        system = dps.ConstrainedSystem(free, links, linear_solver=solver)
-        q, p = system.project(0.0, (y0[0], p))
-        adjoint = dps.FixedStepAdjoint()
-        args = (system, dps.Strang(), 0.0, 0.5, 0.01, (q, p))
-        q, p = diffeqsolve(*args, adjoint=adjoint).ys
-        return jnp.sum(q**3) + jnp.sum(p)
-
-    grad = jax.jit(jax.value_and_grad(loss), static_argnums=1)
-    value, slope = grad(y0[1] + 0.1, None)
-    other, other_slope = grad(y0[1] + 0.1, lx.Tridiagonal())
-    np.testing.assert_allclose(other, value, rtol=1e-12)
-    np.testing.assert_allclose(other_slope, slope, atol=1e-11)
-    # Without a matrix, by products.
-    other, _ = grad(y0[1] + 0.1, lx.GMRES(1e-13, 1e-13))
-    np.testing.assert_allclose(other, value, rtol=1e-11)
-
-
-@pytest.mark.parametrize("n", [2, 5, 17])
-def test_multipliers_by_pivots(n):
-    """Of matrices with zeros on the diagonal, as of Newton's method for long steps."""
-    matrix = np.random.default_rng(n).standard_normal((n, n)) * (1 - np.eye(n))
-    solution = _multipliers.solve(
-        lambda x: jnp.asarray(matrix) @ x, jnp.arange(1.0, n + 1), None
-    )
-    np.testing.assert_allclose(matrix @ solution, np.arange(1.0, n + 1), atol=1e-11)
-
-
-def test_a_linear_system_that_is_not_solved_is_one_member_of_a_batch():
-    """NaN in derivatives too, where Lineax itself raises an error for all."""
-    solver = lx.GMRES(1e-12, 1e-12, max_steps=4, restart=2)
-    matrices = jnp.stack([jnp.eye(6), jnp.diag(jnp.arange(1.0, 7.0))])
-
-    def total(b, A):
-        return jnp.sum(_multipliers.solve(lambda x: A @ x, b, solver))
-
-    slopes = jax.vmap(jax.grad(total), in_axes=(None, 0))(
-        jnp.arange(1.0, 7.0), matrices
-    )
-    np.testing.assert_allclose(slopes[0], jnp.ones(6), rtol=1e-12)
-    assert np.all(np.isnan(slopes[1]))
 
 
 # Gradients.
@@ -413,41 +243,6 @@ def test_an_initial_state_off_the_constraint(q, p, most, adjoint):
         diffeqsolve(sphere(), dps.Strang(), 0.0, 1.0, 0.1, y0, **options)
     y0 = sphere().project(0.0, y0)
     diffeqsolve(sphere(), dps.Strang(), 0.0, 1.0, 0.1, y0, **options)
-
-
-def test_redundant_constraints():
-    y0 = jnp.array([0.6, 0.0, -0.8]), jnp.ones(3)
-    both = lambda t, q, args: jnp.stack([q @ q - 1, 3 * (q @ q) - 3])
-    system = dps.ConstrainedSystem(sphere().system, both)
-    with pytest.raises(Exception, match="The constraints are redundant"):
-        system.project(0.0, y0)
-
-
-def test_a_step_that_is_too_long():
-    y0 = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 2.0, 0.0])
-    with pytest.raises(Exception, match=r"(?s)Newton's method.*Take shorter steps"):
-        diffeqsolve(sphere(), dps.Strang(), 0.0, 1.0, 1.0, y0)
-    far = jnp.zeros(3), jnp.zeros(3)
-    with pytest.raises(Exception, match=r"redundant|did not find positions"):
-        sphere().project(0.0, far)
-
-
-def test_a_step_whose_inverse_ends_elsewhere():
-    def egg(t, q, args):
-        return q[0] ** 2 / 9 + q[1] ** 2 - 1 + q[0] ** 3 / 90
-
-    free = dps.MechanicalSystem(dps.QuadraticKinetic(), lambda t, q, args: 0.0 * q[0])
-    q = jnp.array([3 * np.cos(5.683), np.sin(5.683)]) * 0.95
-    results = []
-    for check in (False, True):
-        system = dps.ConstrainedSystem(free, egg, check_inverse=check)
-        y0 = system.project(0.0, (q, jnp.array([1.0, 0.5])))
-        args, options = (system, dps.Strang(), 0.0), {"throw": False}
-        results.append(diffeqsolve(*args, 1.5, 1.5, y0, **options).result)
-        short = diffeqsolve(*args, 1.0, 0.1, y0, **options)
-        assert short.result == dfx.RESULTS.successful
-    assert results[0] == dfx.RESULTS.successful
-    assert "inverse of a step" in dfx.RESULTS[results[1]]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,117 @@
+"""The multipliers of constraints: their linear systems, and states and steps for which
+there are none."""
+
+from typing import Any
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import pytest
+
+import diffrax_presym as dps
+from diffrax_presym._system import _multipliers
+
+
+diffeqsolve: Any = dfx.diffeqsolve
+G = 9.81
+FREE = dps.MechanicalSystem(dps.QuadraticKinetic(), lambda t, q, args: G * q[2])
+SPHERE = dps.ConstrainedSystem(FREE, lambda t, q, args: q @ q - 1)
+
+
+def bobs(angles):
+    rods = np.stack([np.sin(angles), -np.cos(angles)], axis=1)
+    return jnp.asarray(np.cumsum(rods, axis=0))
+
+
+def links(t, q, args):
+    each = jnp.diff(jnp.concatenate([jnp.zeros((1, 2)), q]), axis=0)
+    return jnp.sum(each**2, axis=1) - 1
+
+
+@pytest.mark.variants(1)
+@pytest.mark.parametrize("n", [12, 1, 2])
+def test_the_diagonals_of_a_chain_are_its_matrix(n):
+    free = dps.MechanicalSystem(
+        *(dps.QuadraticKinetic(jnp.linspace(1.0, 2.0, n)[:, None]),),
+        *(lambda t, q, args: G * jnp.sum(q[:, 1]), dps.ConstantDamping(0.2)),
+    )
+    y0 = bobs(np.linspace(1.0, 1.5, n)), jnp.zeros((n, 2))
+
+    def loss(p, solver):
+        system = dps.ConstrainedSystem(free, links, linear_solver=solver)
+        q, p = system.project(0.0, (y0[0], p))
+        adjoint = dps.FixedStepAdjoint()
+        args = (system, dps.Strang(), 0.0, 0.5, 0.01, (q, p))
+        q, p = diffeqsolve(*args, adjoint=adjoint).ys
+        return jnp.sum(q**3) + jnp.sum(p)
+
+    grad = jax.jit(jax.value_and_grad(loss), static_argnums=1)
+    value, slope = grad(y0[1] + 0.1, None)
+    other, other_slope = grad(y0[1] + 0.1, lx.Tridiagonal())
+    np.testing.assert_allclose(other, value, rtol=1e-12)
+    np.testing.assert_allclose(other_slope, slope, atol=1e-11)
+    # Without a matrix, by products.
+    other, _ = grad(y0[1] + 0.1, lx.GMRES(1e-13, 1e-13))
+    np.testing.assert_allclose(other, value, rtol=1e-11)
+
+
+@pytest.mark.parametrize("n", [2, 5, 17])
+def test_multipliers_by_pivots(n):
+    """Of matrices with zeros on the diagonal, as of Newton's method for long steps."""
+    matrix = np.random.default_rng(n).standard_normal((n, n)) * (1 - np.eye(n))
+    solution = _multipliers.solve(
+        lambda x: jnp.asarray(matrix) @ x, jnp.arange(1.0, n + 1), None
+    )
+    np.testing.assert_allclose(matrix @ solution, np.arange(1.0, n + 1), atol=1e-11)
+
+
+def test_a_linear_system_that_is_not_solved_is_one_member_of_a_batch():
+    """NaN in derivatives too, where Lineax itself raises an error for all."""
+    solver = lx.GMRES(1e-12, 1e-12, max_steps=4, restart=2)
+    matrices = jnp.stack([jnp.eye(6), jnp.diag(jnp.arange(1.0, 7.0))])
+
+    def total(b, A):
+        return jnp.sum(_multipliers.solve(lambda x: A @ x, b, solver))
+
+    slopes = jax.vmap(jax.grad(total), in_axes=(None, 0))(
+        jnp.arange(1.0, 7.0), matrices
+    )
+    np.testing.assert_allclose(slopes[0], jnp.ones(6), rtol=1e-12)
+    assert np.all(np.isnan(slopes[1]))
+
+
+def test_redundant_constraints():
+    y0 = jnp.array([0.6, 0.0, -0.8]), jnp.ones(3)
+    both = lambda t, q, args: jnp.stack([q @ q - 1, 3 * (q @ q) - 3])
+    system = dps.ConstrainedSystem(FREE, both)
+    with pytest.raises(Exception, match="The constraints are redundant"):
+        system.project(0.0, y0)
+
+
+def test_a_step_that_is_too_long():
+    y0 = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 2.0, 0.0])
+    with pytest.raises(Exception, match=r"(?s)Newton's method.*Take shorter steps"):
+        diffeqsolve(SPHERE, dps.Strang(), 0.0, 1.0, 1.0, y0)
+    far = jnp.zeros(3), jnp.zeros(3)
+    with pytest.raises(Exception, match=r"redundant|did not find positions"):
+        SPHERE.project(0.0, far)
+
+
+def test_a_step_whose_inverse_ends_elsewhere():
+    def egg(t, q, args):
+        return q[0] ** 2 / 9 + q[1] ** 2 - 1 + q[0] ** 3 / 90
+
+    free = dps.MechanicalSystem(dps.QuadraticKinetic(), lambda t, q, args: 0.0 * q[0])
+    q = jnp.array([3 * np.cos(5.683), np.sin(5.683)]) * 0.95
+    results = []
+    for check in (False, True):
+        system = dps.ConstrainedSystem(free, egg, check_inverse=check)
+        y0 = system.project(0.0, (q, jnp.array([1.0, 0.5])))
+        args, options = (system, dps.Strang(), 0.0), {"throw": False}
+        results.append(diffeqsolve(*args, 1.5, 1.5, y0, **options).result)
+        short = diffeqsolve(*args, 1.0, 0.1, y0, **options)
+        assert short.result == dfx.RESULTS.successful
+    assert results[0] == dfx.RESULTS.successful
+    assert "inverse of a step" in dfx.RESULTS[results[1]]
