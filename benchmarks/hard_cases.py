@@ -5,51 +5,48 @@ import pathlib
 from typing import Any, cast
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from _hard_cases import (
+    absolute,
+    adaptive,
+    duffing,
+    end,
+    FEW,
+    harmonic,
+    height,
+    henon_heiles,
+    LEAPFROG,
+    mixed,
+    pendulum,
+    QUADRATIC,
+    quartic,
+    RKN4,
+    RKN6,
+    root,
+    run,
+    successful,
+)
+from _hard_friction import stability
+from _hard_orbits import encounters, infalls, kepler
 from _plot import panels, save, slope
 from _report import command_line, Table
-from _schemes import SCHEMES, stability_limit, step_matrices
-from _solve import CONSTANT, last, reference, reference_end, solve
-from problems import henon_heiles as damped_henon_heiles, mechanics
+from _schemes import SCHEMES
+from _solve import CONSTANT, last, reference_end, solve
+from problems import mechanics
 
 import diffrax_presym as dps
 
 
-LEAPFROG = dps.PresymplecticLeapfrog()
-RKN4 = dps.BlanesMoanRKN4()
-RKN6 = dps.BlanesMoanRKN6()
-QUADRATIC = dps.QuadraticKinetic()
-
-harmonic = lambda t, q, args: jnp.sum(q**2) / 2
-pendulum = lambda t, q, args: jnp.sum(1 - jnp.cos(q))
-absolute = lambda t, q, args: jnp.sum(jnp.abs(q))
-# Not defined for negative positions.
-root = lambda t, q, args: -jnp.sum(jnp.sqrt(q))
-# Without a lower bound: the motion reaches infinity in finite time.
-quartic = lambda t, q, args: -jnp.sum(q**4)
-mixed = lambda t, q, p, args: (1 + jnp.sum(q**2)) * (1 + jnp.sum(p**2)) / 2
-duffing = lambda t, q, args: jnp.sum(q**4 / 4 - q**2 / 2 - 0.3 * q * jnp.cos(1.2 * t))
-henon_heiles = damped_henon_heiles().system.potential
-softened = lambda q, args: jnp.sum(q**2) + (0.0 if args is None else args**2)
-newton = lambda t, q, args: -1 / jnp.sqrt(softened(q, args))
-# A step density, by Kepler's third law.
-distance = lambda t, y, args: jnp.linalg.norm(y[0]) ** 1.5
-height = lambda t, y, args, **kwargs: y[0][0]
-
-run = eqx.filter_jit(solve)
-ZERO = jnp.zeros(())
-adaptive = lambda tolerance: dfx.PIDController(rtol=tolerance, atol=tolerance)
-successful = lambda sol: sol.result == dfx.RESULTS.successful
-
-
-def end(*arguments, **options):
-    """The solve, and its final state in double precision."""
-    sol = run(*arguments, **options)
-    return sol, jax.tree.map(lambda x: np.asarray(x, np.float64), last(sol))
+def canonical_form(potential, gamma):
+    """The same system in canonical momenta, the naive way: P grows like exp(eta)."""
+    gradient = jax.grad(potential, argnums=1)
+    return dps.MechanicalSystem(
+        lambda t, p, args: jnp.exp(-gamma * t) * jnp.sum(p**2) / 2,
+        dps.ForceField(lambda t, q, args: -jnp.exp(gamma * t) * gradient(t, q, args)),
+    )
 
 
 def overflow(quick):
@@ -77,128 +74,6 @@ def overflow(quick):
                 good = np.isfinite(q).all() and np.isfinite(p).all()
                 cells.append(f"{q[0]:+.3f}" if good else "nan")
             table.row(jnp.dtype(dtype).name, eta, *cells)
-
-
-def canonical_form(potential, gamma):
-    """The same system in canonical momenta, the naive way: P grows like exp(eta)."""
-    gradient = jax.grad(potential, argnums=1)
-    return dps.MechanicalSystem(
-        lambda t, p, args: jnp.exp(-gamma * t) * jnp.sum(p**2) / 2,
-        dps.ForceField(lambda t, q, args: -jnp.exp(gamma * t) * gradient(t, q, args)),
-    )
-
-
-# Those that the groups of one scheme each compare.
-FEW = (
-    "PresymplecticEuler PresymplecticLeapfrog SuzukiYoshida(4) Suzuki4 "
-    "BlanesMoan4 BlanesMoanRKN4 SofroniouSpaletta(6) BlanesMoan6 BlanesMoanRKN6 "
-    "SofroniouSpaletta(8) BlanesCasasRKN8"
-).split()
-
-
-def stability(quick):
-    """The end of the first interval of stability, by the trace of a step."""
-    table = Table(
-        "2. stability: the largest h * omega below which every step is stable",
-        *("scheme:<21", "undamped:>8.2f", "gamma = omega / 2:>17.2f"),
-    )
-    for name in (*FEW, "TunedRKN6"):
-        table.row(name, *(stability_limit(SCHEMES[name], x) for x in (0.0, 0.5)))
-    # Frequencies 1 to 1e4 in one system, at and beyond the limit of the fastest.
-    omega = jnp.logspace(0, 4, 5)
-    stiff = mechanics(lambda t, q, args: jnp.sum((omega * q) ** 2) / 2)
-    y0 = (jnp.ones(5) / omega, jnp.zeros(5))
-    table = Table(
-        "   frequencies 1 to 1e4, the leapfrog to t = 0.2: energy error",
-        *("h * omega_max:>13", "error:>9.1e", "result:>10"),
-    )
-    for factor in (1.0, 1.9, 2.1):
-        sol, (q, p) = end(stiff, LEAPFROG, 0.0, 0.2, factor * 1e-4, y0)
-        with np.errstate(over="ignore", invalid="ignore"):
-            energy = np.sum(p**2 + (np.asarray(omega) * q) ** 2) / 5
-        table.row(str(factor), energy - 1, "" if successful(sol) else "reported")
-    strong_friction(quick)
-    slow_motion(quick)
-
-
-def slow_motion(quick):
-    """Errors of position and momentum of an oscillator with h omega = 0.3, relative to
-    the exact values, at the time in which friction lets the slow motion fall by 1 / e,
-    20 steps or more; in two loops, whose results are the same."""
-    products = (0.1, 1.0, 10.0, 100.0)
-    table = Table(
-        "   strong friction: errors of q and p for each h gamma, h omega = 0.3",
-        "scheme:<38",
-        *(f"{x:g}, {part}:>8.0e" for x in products for part in "qp"),
-    )
-    strang = dps.Strang()
-    solvers: dict[str, Any] = {name: x.solver for name, x in SCHEMES.items()}
-    solvers |= {
-        "SuzukiYoshida(4, Strang)": dps.SuzukiYoshida(4, strang),
-        "SofroniouSpaletta(6, Strang)": dps.SofroniouSpaletta(6, strang),
-        "Compensated(TunedRKN6)": dps.Compensated(dps.TunedRKN6()),
-        "PresymplecticGauss(4)": dps.PresymplecticGauss(4),
-        "PresymplecticGauss(4, Newton)": dps.PresymplecticGauss(
-            4, optx.Newton(1e-12, 1e-12)
-        ),
-    }
-    loops = dps.FixedStepAdjoint(), dfx.ForwardMode()
-    for name, solver in solvers.items():
-        rows = []
-        for adjoint in loops[: 1 if quick else 2]:
-            cells = []
-            for x in products:
-                system = mechanics(
-                    dps.QuadraticPotential(0.09), dps.ConstantDamping(jnp.asarray(x))
-                )
-                # Two rates; the smaller one without cancellation.
-                root = (x * x / 4 - 0.09 + 0j) ** 0.5
-                fast = -x / 2 - root
-                slow = 0.09 / fast
-                t = float(max(20, np.ceil(x / 0.09)))
-                y0 = (jnp.ones(1), jnp.zeros(1))
-                sol, y = end(system, solver, 0.0, t, 1.0, y0, adjoint=adjoint)
-                grow, decay = np.exp(slow * t), np.exp(fast * t)
-                exact = (fast * grow - slow * decay) / (fast - slow), grow - decay
-                exact = exact[0].real, (slow * fast / (fast - slow) * exact[1]).real
-                good = successful(sol)
-                pairs = zip(y, exact, strict=True)
-                cells += [a[0] / b - 1 if good else np.inf for a, b in pairs]
-            rows.append(cells)
-        np.testing.assert_allclose(rows[0], rows[-1], rtol=0.05, atol=1e-11)
-        table.row(name, *rows[0])
-
-
-def strong_friction(quick):
-    """From which friction a solution grows, by the eigenvalues of a step, and from
-    which a solve fails, as it is more than the scheme resolves."""
-    parts = "stable to", "error", "fails"
-    table = Table(
-        "   strong friction of q'' = -q - gamma q': the largest h gamma at which no "
-        "solution\n   grows, the error of the slow motion there, and the first h gamma "
-        "that fails",
-        "scheme:<21",
-        *(f"h = {h:g}, {x}:>18.3g" for h in (0.5, 1.0) for x in parts),
-    )
-    products = np.geomspace(0.05, 400, 60 if quick else 1200)
-    for name in (*FEW, "Strang", "TunedRKN6", "SofroniouSpaletta(10)"):
-        cells = []
-        for h in (0.5, 1.0):
-            gamma, steps = products / h, jnp.full(len(products), h)
-            solver = SCHEMES[name].solver
-            matrices = np.array(step_matrices(solver, steps, jnp.asarray(gamma)))
-            fails = ~np.all(np.isfinite(matrices), axis=(1, 2))
-            matrices[fails] = np.diag([2.0, 2.0])
-            radius = np.max(np.abs(np.linalg.eigvals(matrices)), axis=1)
-            # Of the motion that friction slows down.
-            rate = (-gamma + np.sqrt((gamma**2 - 4).astype(complex))) / 2
-            error = np.abs(radius - np.abs(np.exp(h * rate)))
-            first = lambda bad: int(np.argmax(np.append(bad, True)))
-            stable, failed = first(radius > 1 + 1e-12), first(fails)
-            limits = np.append(products, np.inf)
-            last_stable = np.inf if stable == len(products) else products[stable - 1]
-            cells += [last_stable, error[stable - 1], limits[failed]]
-        table.row(name, *cells)
 
 
 def long_times(quick):
@@ -245,140 +120,6 @@ def long_times(quick):
         (q, _), *_ = solver.step(free, t0, t0 + n * h, y0, None, carry, False)
         table.row(name, abs(float(q[0]) / (n * 0.01) - 1))
     return growth
-
-
-def kepler(quick):
-    """Orbits of e = 0.9, with drag and without: controller, constant steps, Dopri8."""
-    e, orbits = 0.9, 100 if quick else 2000
-    y0 = (jnp.array([1 - e, 0.0]), jnp.array([0.0, ((1 + e) / (1 - e)) ** 0.5]))
-    t1 = 2 * np.pi * orbits
-    # Times of no common period with the orbit, so that all phases are seen.
-    ts = jnp.linspace(0.0, t1, 20 * orbits + 1)
-    series = {}
-    for drag in (None, 1e-5):
-        system = mechanics(newton)
-        if drag is not None:
-            system = mechanics(newton, dps.ConstantDamping(drag))
-        record = lambda t, y, args, s=system: s.energy(t, y[0], y[1], args)
-        density = lambda epsilon: dps.StepDensityController(epsilon, distance)
-        runs = {
-            "RKN6, density": (RKN6, density(0.25)),
-            "leapfrog, density": (LEAPFROG, density(0.04)),
-            "leapfrog, constant": (LEAPFROG, CONSTANT),
-            "Dopri8, 1e-8": (dfx.Dopri8(), adaptive(1e-8)),
-            "Tsit5, 1e-8": (dfx.Tsit5(), adaptive(1e-8)),
-        }
-        costs = (14, 1, 1, 14, 6)
-        exact = -0.5
-        if drag is not None:
-            q, p = reference(system, y0, ts, tolerance=1e-9)
-            energies = jax.vmap(lambda t, q, p, s=system: s.energy(t, q, p, None))
-            exact = np.append(-0.5, energies(ts[1:], q, p))
-        table = Table(
-            f"4. Kepler, e = {e}, {orbits} orbits, drag {drag or 0:g}: energy error",
-            *("solver:<18", "forces per orbit:>16.0f"),
-            *("first tenth:>11.1e", "last tenth:>10.1e"),
-        )
-        saveat = dfx.SaveAt(ts=ts, fn=record)
-        for (name, (solver, control)), cost in zip(runs.items(), costs, strict=True):
-            dt0 = 2 * np.pi / 4000 if control is CONSTANT else None
-            problem = system, solver, 0.0, t1, dt0, y0
-            sol = run(*problem, controller=control, saveat=saveat)
-            error = np.abs(np.asarray(sol.ys) - exact)
-            series[name, drag] = error
-            tenth, forces = len(error) // 10, int(sol.stats["num_steps"]) * cost
-            first, last = error[1:tenth].max(), error[-tenth:].max()
-            table.row(name, forces / orbits, first, last)
-    return series
-
-
-def encounters(quick):
-    """Energy errors where bodies come close."""
-    table = Table(
-        "   ten orbits: energy error of the leapfrog",
-        *("e:>4", "softening:>9", "steps:>6d", "density:>8.1e"),
-        *("steps:>6d", "constant:>8.1e"),
-    )
-    for e, soft in ((0.9, None), (0.99, None), (0.99, 1e-2)):
-        # From the far end, where softening does not matter.
-        q0 = jnp.array([1 + e, 0.0])
-        y0 = (q0, jnp.array([0.0, ((1 - e) / (1 + e)) ** 0.5]))
-        system = mechanics(newton)
-        start = float(system.energy(ZERO, *y0, soft))
-        cells = []
-        for control, dt0 in (
-            (dps.StepDensityController(0.04, distance), None),
-            (CONSTANT, 2 * np.pi / 4000),
-        ):
-            t1 = 20 * np.pi + 3
-            problem = system, LEAPFROG, 0.0, t1, dt0, y0, soft
-            sol, (q, p) = end(*problem, controller=control)
-            error = float(system.energy(ZERO, q, p, soft)) - start
-            cells += [int(sol.stats["num_steps"]), abs(error)]
-        table.row(str(e), str(soft or 0), *cells)
-
-
-def kepler_cases(lows):
-    """Close encounters of two bodies: name, initial state, time, and the position at
-    the end in closed form. Without cancellation at the pericentre."""
-    starts = {"apocentre": np.pi, "pericentre": 0.0, "outwards": 2.0, "inwards": -0.3}
-    for low in lows:
-        b = (low * (2 - low)) ** 0.5
-        for name, x in starts.items():
-            versed = 2 * np.sin(x / 2) ** 2
-            r = low + (1 - low) * versed
-            q, p = (low - versed, b * np.sin(x)), (-np.sin(x) / r, b * np.cos(x) / r)
-            yield f"1 - e = {low:g}, {name}", (q, p), 2 * np.pi, q
-    # Fly-bys are symmetric about the axis; `x` is half of the true anomaly's tangent.
-    low, x = 1e-3, 40.0
-    q, p = (low * (1 - x**2), -2 * low * x), np.array([x, 1]) * (2 / low) ** 0.5
-    t1 = 2 * (2 * low**3) ** 0.5 * (x + x**3 / 3)
-    yield "parabola", (q, p / (1 + x**2)), t1, (q[0], -q[1])
-    x, e = 1.5, 1 + low
-    b, versed = (low * (2 + low)) ** 0.5, 2 * np.sinh(x / 2) ** 2
-    q, p = (low - versed, -b * np.sinh(x)), np.array([np.sinh(x), b * np.cosh(x)])
-    t1 = 2 * (e * np.sinh(x) - x)
-    yield "hyperbola", (q, p / (low + e * versed)), t1, (q[0], -q[1])
-
-
-def infalls(quick):
-    """Steps by a density where bodies come close, for many `epsilon`."""
-    epsilons = (0.3, 0.2, 0.1, 0.05, 0.02, 0.01)
-    table = Table(
-        "   close encounters, BlanesMoanRKN6, steps by a density: steps at epsilon = "
-        "0.1,\n   and for each epsilon the error of the position, of three bodies that "
-        "of the energy",
-        *("case:<25", "steps:>6d", *(f"{x:g}:>8.0e" for x in epsilons)),
-    )
-
-    def row(name, system, density, t1, y0, error):
-        cells, steps = [], {}
-        y0 = jax.tree.map(jnp.asarray, y0)
-        for x in epsilons:
-            control = dps.StepDensityController(jnp.array(x), density)
-            problem = system, RKN6, ZERO, jnp.array(t1), None, y0
-            sol, y = end(*problem, controller=control)
-            steps[x] = int(sol.stats["num_steps"])
-            cells.append(error(*y) if successful(sol) else "failed")
-        table.row(name, steps[0.1], *cells)
-
-    one = mechanics(newton)
-    for name, y0, t1, exact in kepler_cases(10.0 ** -np.arange(1, 3 if quick else 6)):
-        y0 = tuple(map(jnp.array, y0))
-        error = lambda q, p, exact=exact: np.linalg.norm(q - np.array(exact))
-        row(name, one, distance, t1, y0, error)
-    distances = lambda q: jnp.linalg.norm(q - jnp.roll(q, 1, axis=0), axis=1)
-    masses = jnp.array([[3.0, 3.0], [4.0, 4.0], [5.0, 5.0]])
-    three = dps.MechanicalSystem(
-        dps.QuadraticKinetic(masses),
-        lambda t, q, args: -jnp.sum(jnp.array([15.0, 12.0, 20.0]) / distances(q)),
-    )
-    density = lambda t, y, args: jnp.sum(distances(y[0]) ** -3) ** -0.5
-    y0 = jnp.array([[1.0, 3.0], [-2.0, -1.0], [1.0, -1.0]]), jnp.zeros((3, 2))
-    start = float(three.energy(ZERO, *y0))
-    error = lambda q, p: abs(float(three.energy(ZERO, q, p)) / start - 1)
-    for t1 in (10.0, 60.0):
-        row(f"three bodies, t = {t1:g}", three, density, t1, y0, error)
 
 
 def chaos(quick):

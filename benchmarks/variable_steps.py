@@ -19,7 +19,6 @@ or, for Kepler orbits, by Kepler's equation.
 """
 
 import importlib.metadata
-import importlib.util
 from functools import partial
 from typing import Any
 
@@ -28,23 +27,29 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.integrate
-import scipy.optimize
+from _ias15 import found, ias15, simulation
 from _plot import colors, FOLDER, panels, save
 from _report import command_line, Table
 from _schemes import DIFFRAX, SCHEMES
 from _solve import last, relative_error, solve, states
 from _timing import error_curves, interleaved, least_to
-from jax.flatten_util import ravel_pytree
-from problems import mechanics, Problem
+from problems import mechanics
 from problems_test import pleiades
+from problems_variable import (
+    arenstorf,
+    ATTRACTION,
+    densities,
+    eccentric,
+    exact,
+    galaxy,
+    orbit,
+)
 
 import diffrax_presym as dps
 
 
 OURS = ("BlanesMoanRKN4", "TunedRKN6", "BlanesCasasRKN8")
 TARGETS = 1e-3, 1e-6, 1e-9
-ATTRACTION = mechanics(lambda t, q, args: -1 / jnp.linalg.norm(q))
 
 
 def variable(system, solver, times, y0, epsilon, density=None, **options) -> Any:
@@ -52,13 +57,6 @@ def variable(system, solver, times, y0, epsilon, density=None, **options) -> Any
     controller = dps.StepDensityController(epsilon, density or system)
     more: Any = {"adjoint": dps.FixedStepAdjoint()} | options
     return solve(system, solver, *times, None, y0, controller=controller, **more)
-
-
-def eccentric(e, anomaly=0.0):
-    """Position and momentum at an eccentric anomaly, of an orbit of period 2 pi."""
-    b, rate = np.sqrt(1 - e**2), 1 / (1 - e * np.cos(anomaly))
-    q = np.array([np.cos(anomaly) - e, b * np.sin(anomaly)])
-    return q, rate * np.array([-np.sin(anomaly), b * np.cos(anomaly)])
 
 
 def kepler(quick):
@@ -89,24 +87,6 @@ def kepler(quick):
 
 
 MASSES = np.array([3.0, 4.0, 5.0])
-
-
-def found(module):
-    return importlib.util.find_spec(module) is not None
-
-
-def simulation(masses, q, v, epsilon):
-    """Bodies in the plane, for IAS15."""
-    import rebound  # pyright: ignore[reportMissingImports]
-
-    sim: Any = rebound.Simulation()
-    for m, (x, y), (vx, vy) in zip(masses, q, v, strict=True):
-        sim.add(m=m, x=float(x), y=float(y), vx=float(vx), vy=float(vy))
-    sim.integrator = "ias15"
-    # Of REBOUND 5, and of those before.
-    settings: Any = getattr(sim, "ri_ias15", sim.integrator)
-    settings.epsilon = epsilon
-    return sim
 
 
 def to_sixty(system, y0, name, parameter):
@@ -146,7 +126,7 @@ def burrau(quick):
     runs = [("Dopri8", 1e-13), ("BlanesCasasRKN8", 0.05)]
     epsilons = (0.1,) if quick else (0.1, 0.05, 0.02)
     runs += [("the same, Compensated", x) for x in epsilons]
-    runs += [("IAS15", 1e-9), ("IAS15", 1e-12)] if found("rebound") else []
+    runs += [("IAS15", 1e-9), ("IAS15", 1e-12)] if found() else []
     for name, parameter in runs:
         q, p, steps = to_sixty(system, y0, name, parameter)
         drift = abs(float(system.energy(0.0, q, p)) - float(system.energy(0.0, *y0)))
@@ -159,108 +139,6 @@ def burrau(quick):
         e = np.sqrt(1 - spin**2 / (mass * axis))
         cells = *q[escaping], axis, e, drift
         table.row(name, parameter, str(steps), MASSES[escaping], *cells)
-
-
-MOON = 0.012277471
-
-
-def restricted(q, t):
-    """The places of earth and moon, in the frame at rest."""
-    along = jnp.stack([jnp.cos(t), jnp.sin(t)])
-    return jnp.linalg.norm(q + MOON * along), jnp.linalg.norm(q - (1 - MOON) * along)
-
-
-def arenstorf():
-    """Hairer, Norsett and Wanner (1993), section II.0, in the frame at rest."""
-
-    def potential(t, q, args):
-        earth, moon = restricted(q, t)
-        return -(1 - MOON) / earth - MOON / moon
-
-    speed, period = -2.00158510637908252240537862224, 17.0652165601579625588917206249
-    p0 = [0.0, speed + 0.994]
-    return Problem("Arenstorf orbit", mechanics(potential), [0.994, 0.0], p0, period)
-
-
-def galaxy():
-    """A cusp of the density 1 / r, Hernquist's (1990), flattened: about 50 orbits."""
-    axes = np.array([1.0, 0.9, 0.7])
-    system = mechanics(lambda t, q, args: -1 / (1 + jnp.linalg.norm(q / axes)))
-    return Problem("cusped galaxy", system, [1.0, 0.0, 0.2], [0.0, 0.2, 0.1], 300.0)
-
-
-def orbit():
-    q0, p0 = eccentric(0.9)
-    return Problem("Kepler, e = 0.9", ATTRACTION, q0, p0, 200 * np.pi)
-
-
-def densities(name):
-    """The time scale as a user writes it."""
-    stars: Any = pleiades().distances
-    moons = lambda t, q: (restricted(q, t)[0] ** 3, restricted(q, t)[1] ** 3 / MOON)
-    return {
-        "Pleiades": lambda t, y, args: jnp.sum(stars(y[0]) ** -3) ** -0.5,
-        "Kepler, e = 0.9": lambda t, y, args: jnp.linalg.norm(y[0]) ** 1.5,
-        "Arenstorf orbit": lambda t, y, args: (
-            sum(1 / x for x in moons(t, y[0])) ** -0.5
-        ),
-        "cusped galaxy": lambda t, y, args: jnp.linalg.norm(y[0]) ** 0.5,
-    }[name]
-
-
-def exact(problem, ts):
-    """The solution at the times, by methods that are not compared."""
-    if problem.name.startswith("Kepler"):
-        mean = np.mod(ts + np.pi, 2 * np.pi) - np.pi
-        late = lambda x, m: x - 0.9 * np.sin(x) - m
-        find: Any = partial(scipy.optimize.brentq, late, -4, 4, xtol=1e-15)
-        anomalies = [find(args=(m,)) for m in mean]
-        q, p = zip(*(eccentric(0.9, x) for x in anomalies), strict=True)
-        return np.array(q), np.array(p)
-    flat, unravel = ravel_pytree(problem.y0)
-    slope = jax.jit(
-        lambda t, y: ravel_pytree(problem.system.vf(t, unravel(y), None))[0]
-    )
-    solved = scipy.integrate.solve_ivp(
-        *(lambda t, y: np.asarray(slope(t, y)), (0.0, problem.t1), flat, "DOP853", ts),
-        rtol=3e-14,
-        atol=1e-15,
-    )
-    return jax.vmap(unravel)(jnp.asarray(solved.y.T))
-
-
-def ias15(problem, ts):
-    """A solve by REBOUND, by the tolerance; `None` where it does not apply."""
-    if not found("rebound"):
-        return None
-    q0, p0 = map(np.asarray, problem.y0)
-    if problem.name == "Pleiades":
-        masses = np.arange(1.0, 8)
-        q0, v0, first = q0.T, (p0 / masses).T, 0
-    elif problem.name == "Arenstorf orbit":
-        masses, first = np.array([1 - MOON, MOON, 0.0]), 2
-        q0 = np.stack([np.array([-MOON, 0]), np.array([1 - MOON, 0]), q0])
-        v0 = np.stack([np.array([0, -MOON]), np.array([0, 1 - MOON]), p0])
-    elif problem.name.startswith("Kepler"):
-        masses, first = np.array([1.0, 0.0]), 1
-        q0, v0 = np.stack([0 * q0, q0]), np.stack([0 * p0, p0])
-    else:
-        return None
-
-    def run(epsilon):
-        sim = simulation(masses, q0, v0, epsilon)
-        out = np.empty((len(ts), 2, *np.shape(problem.q0)))
-        for row, t in zip(out, ts, strict=True):
-            sim.integrate(t)
-            for i, body in enumerate(sim.particles[first:]):
-                at = (..., i) if problem.name == "Pleiades" else ...
-                row[0][at] = body.x, body.y
-                row[1][at] = body.vx, body.vy
-            if problem.name == "Pleiades":
-                row[1] *= masses
-        return (out[:, 0], out[:, 1]), sim.steps_done, False
-
-    return run
 
 
 def runs_of(problem, ts):
@@ -290,7 +168,7 @@ def runs_of(problem, ts):
 
 
 def speed(quick):
-    if found("rebound"):
+    if found():
         print(f"REBOUND {importlib.metadata.version('rebound')}")
     else:
         print("REBOUND is not installed: IAS15 is omitted.")
