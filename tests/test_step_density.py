@@ -229,6 +229,7 @@ def by_own_loop(solver, **options):
 
 
 WRONG: Any = 1.0
+BOTH = dfx.SaveAt(ts=jnp.ones(1), steps=True)
 vector = lambda t, y, args: y[0]
 
 
@@ -240,7 +241,7 @@ vector = lambda t, y, args: y[0]
         (lambda: control(0.1, WRONG), "density"),
         (lambda: solve(CONTROL, LEAPFROG, 0.0, 1.0, Y0, dt0=0.1), "dt0=None"),
         (lambda: solve(control(0.1, vector), LEAPFROG, 0.0, 1.0, Y0), "real scalar"),
-        (lambda: by_own_loop(LEAPFROG, saveat=STEPS), "`SaveAt.steps=...."),
+        (lambda: by_own_loop(LEAPFROG, saveat=BOTH), "times and steps in one.*subs="),
         (lambda: by_own_loop(dps.SymmetricMultistep()), "equal steps"),
     ],
 )

@@ -1,10 +1,11 @@
-"""Saved values of variable steps, each a shorter step: beside Kepler's equation, and
-their gradients beside central differences."""
+"""Saved values of variable steps, shorter steps or their ends: beside Kepler's equation
+and Diffrax's loop, and their gradients beside central differences."""
 
 from functools import partial
 from typing import Any
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -93,6 +94,35 @@ def test_gaps_and_the_end_of_a_solve():
     np.testing.assert_allclose(short.ys[0][reached], whole[reached], atol=1e-14)
 
 
+SAVED = {
+    "every step": dfx.SaveAt(steps=True),
+    "both ends": dfx.SaveAt(t0=True, steps=3, t1=True),
+    "with times": dfx.SaveAt(
+        subs=[
+            dfx.SubSaveAt(ts=jnp.linspace(0.0, 12.0, 7)),
+            dfx.SubSaveAt(steps=4, fn=lambda t, y, args: (t, y[0])),
+        ]
+    ),
+}
+
+
+@pytest.mark.parametrize("saved", SAVED)
+@pytest.mark.parametrize("back", [False, True])
+def test_ends_of_steps_are_those_of_the_other_loop(saved, back):
+    options = {"saveat": SAVED[saved], "max_steps": 100}
+    if back:
+        flip = lambda x: -x if eqx.is_array(x) else x
+        options["saveat"] = jax.tree.map(flip, SAVED[saved])
+    t1 = -12.0 if back else 12.0
+    own, theirs = (
+        solve(kepler(), 0.3, TS, adjoint, t1=t1, **options) for adjoint in (OWN, THEIRS)
+    )
+    assert own.stats["num_steps"] == theirs.stats["num_steps"]
+    both = [jax.tree.leaves((sol.ts, sol.ys)) for sol in (own, theirs)]
+    for x, y in zip(*both, strict=True):
+        np.testing.assert_allclose(x, y, atol=1e-10)
+
+
 # Gradients.
 
 AT = np.array([0.02, 0.9, 1.1])  # friction, and factors of the state
@@ -118,3 +148,25 @@ def test_gradients_are_those_of_the_saved_values(way):
     slope = lambda e, h: (fn(AT + h * e) - fn(AT - h * e)) / (2 * h)
     wanted = [(4 * slope(e, 1e-5) - slope(e, 2e-5)) / 3 for e in np.eye(3)]
     np.testing.assert_allclose(jax.grad(fn)(AT), wanted, rtol=1e-8)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_gradients_of_the_ends_of_steps_and_of_their_times(way):
+    """Times depend on the states before them."""
+    saveat = dfx.SaveAt(steps=2, t1=True, fn=lambda t, y, args: (y, t * y[0]))
+    reached = lambda x: jnp.where(jnp.isfinite(x), x, 0)
+
+    @jax.jit
+    def fn(x):
+        y0 = x[1] * START[0], x[2] * START[1]
+        options = {"y0": y0, "saveat": saveat, "max_steps": 300}
+        sol = solve(kepler(x[0]), 0.3, TS, WAYS[way], **options)
+        squares = [jnp.sum(reached(y) ** 2) for y in jax.tree.leaves(sol.ys)]
+        return sum(squares) + jnp.sum(reached(sol.ts) ** 3)
+
+    slope = lambda e, h: (fn(AT + h * e) - fn(AT - h * e)) / (2 * h)
+    wanted = [(4 * slope(e, 1e-5) - slope(e, 2e-5)) / 3 for e in np.eye(3)]
+    np.testing.assert_allclose(jax.grad(fn)(AT), wanted, rtol=1e-7)
+    many = jnp.stack([AT, 1.1 * AT])
+    each = [jax.grad(fn)(x) for x in many]
+    np.testing.assert_allclose(jax.vmap(jax.grad(fn))(many), each, rtol=1e-10)

@@ -39,9 +39,10 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     after the end of a solve.
 
     For every solver of this package, with `diffrax.ConstantStepSize`, `StepsBetween`,
-    `diffrax.StepTo` or `StepDensityController`, and any `SaveAt` but dense output, and
-    with variable steps `steps=`. With a constant step the steps are all equal: as few
-    as are not longer than `dt0`. (Diffrax takes the first of the length `dt0`, if that
+    `diffrax.StepTo` or `StepDensityController`, and any `SaveAt` but dense output. With
+    variable steps `ts=` and `steps=` need two of `SaveAt(subs=...)`, and the times of
+    `steps=` have derivatives. With a constant step the steps are all equal: as few as
+    are not longer than `dt0`. (Diffrax takes the first of the length `dt0`, if that
     does not divide the time of the solve; and its times may differ in the last bit.)
     Events, dense output and adaptive steps are errors; use
     `diffrax.RecursiveCheckpointAdjoint` for these.
@@ -189,8 +190,9 @@ def _check(solver, controller, event, saveat, passed_controller_state) -> None:
         what = "events"
     elif saveat.dense:
         what = "dense output"
-    elif not isinstance(controller, _KNOWN) and _saves_steps(saveat):
-        what = "`SaveAt(steps=...)` with `StepDensityController`"
+    elif not isinstance(controller, _KNOWN) and _saves_both(saveat):
+        what = "times and steps in one output of `StepDensityController`"
+        instead = "`SaveAt(subs=[SubSaveAt(ts=...), SubSaveAt(steps=...)])`"
     elif isinstance(controller, _KNOWN) and passed_controller_state:
         what = "a `controller_state`"
     if what is not None:
@@ -202,8 +204,9 @@ def _check(solver, controller, event, saveat, passed_controller_state) -> None:
 _KNOWN = dfx.ConstantStepSize, dfx.StepTo, StepsBetween
 
 
-def _saves_steps(saveat: dfx.SaveAt) -> bool:
-    return any(sub.steps for sub in private.flatten_subs(saveat)[0])
+def _saves_both(saveat: dfx.SaveAt) -> bool:
+    subs, _ = private.flatten_subs(saveat)
+    return any(sub.steps and sub.ts is not None for sub in subs)
 
 
 def _check_history(solver, scheme: Scheme, controller) -> None:
@@ -282,7 +285,7 @@ def _solve_bwd(trace, bars, perturbed, inputs, way: Reversal | Checkpoints):
     )
     carry_bar = zeros(problem.start[1], carry_bar)
     saved_bars = [
-        zeros(ys, bar[1]) for (_, ys), bar in zip(buffers, saved_bars, strict=True)
+        zeros(saved, bar[:2]) for saved, bar in zip(buffers, saved_bars, strict=True)
     ]
     backward = Backward(problem, trace, perturbed[0].functions, saved_bars, carry_bar)
     at = way.pull_back(backward)

@@ -53,7 +53,7 @@ class Backward(eqx.Module):
     problem: Problem
     trace: Trace
     wanted: PyTree  # the differentiated leaves of the functions
-    saved_bars: list[PyTree]  # the cotangents of what each output saved
+    saved_bars: list[PyTree]  # the cotangents of the times and values of each output
     carry_bar: PyTree
 
     @property
@@ -159,7 +159,14 @@ class Backward(eqx.Module):
 
     def row(self, i: int, row: Array, pred: Any) -> PyTree:
         """The cotangent of one row of an output, or zero."""
-        return jtu.tree_map(lambda x: jnp.where(pred, x[row], 0), self.saved_bars[i])
+        return self._row(self.saved_bars[i][1], row, pred)
+
+    def time(self, i: int, row: Array, pred: Any) -> Array:
+        """The cotangent of its time."""
+        return self._row(self.saved_bars[i][0], row, pred)
+
+    def _row(self, bars: PyTree, row: Array, pred: Any) -> PyTree:
+        return jtu.tree_map(lambda x: jnp.where(pred, x[row], 0), bars)
 
     def _pull_point(self, i: int, n: Array, point: Point, bar: PyTree):
         """Pull back an output saved at a step, to the functions and the state."""
@@ -212,11 +219,17 @@ class PullRows(AbstractPull):
         taken = rows.stop[j] >= 0
         if (stencils := problem.stencils[i]) is not None:
             taken &= ~stencils.ways.interpolated
-        bar = backward.row(i, int(problem.subs[i].t0) + j, taken)
+        row = int(problem.subs[i].t0) + j
+        bar: PyTree = backward.row(i, row, taken)
+        # Where steps end depends on the states before them.
+        depends = not (problem.steps.are_known or rows.may_be_inside)
+        if depends:
+            bar = backward.time(i, row, taken), bar
 
         def pull(shorter: bool):
             def output(functions: Functions, start: Point):
-                return problem.output(i, functions, j, start, shorter)[0]
+                saved = problem.output(i, functions, j, start, shorter)[0]
+                return (problem.steps.begin(at.n, start), saved) if depends else saved
 
             return backward.pull(output, bar, at.point)
 

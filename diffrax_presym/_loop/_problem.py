@@ -173,6 +173,9 @@ class Problem(eqx.Module):
         it, is `found` if the steps are not known beforehand."""
         rows, y = self.rows[i], start[0]
         n, inside = (rows.stop[j], rows.inside[j]) if found is None else found
+        time = rows.time[j]
         if rows.may_be_inside:
-            y = self.between(functions, n, start, rows.time[j], inside, shorter)
-        return functions.outputs[i](rows.time[j], y), tree.all_finite(y)
+            y = self.between(functions, n, start, time, inside, shorter)
+        elif not self.steps.are_known:
+            time = self.steps.begin(n, start)
+        return functions.outputs[i](time, y), tree.all_finite(y)

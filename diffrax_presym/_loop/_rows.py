@@ -12,6 +12,7 @@ from ._steps import Steps
 class Rows(eqx.Module):
     """What one of `SaveAt(subs=...)` saves between the ends of a solve, in order."""
 
+    # Not a number where it is that of a step whose end is not known beforehand.
     time: Float[Array, " rows"]
     # The step from whose start it is computed; -1 if its time is not a number, a gap in
     # measured times, for which nothing is saved.
@@ -31,10 +32,10 @@ class Rows(eqx.Module):
             insides.append(inside & ~gap)
         number = 0 if sub.ts is None else len(sub.ts)
         if sub.steps:
-            # As has been checked.
-            assert max_steps is not None and isinstance(steps, Steps)
+            assert max_steps is not None  # As has been checked.
             n = sub.steps * jnp.arange(1, max_steps // sub.steps + 1)
-            times.append(steps.time(n))
+            unknown = jnp.full(n.shape, jnp.nan, steps.t0.dtype)
+            times.append(steps.time(n) if isinstance(steps, Steps) else unknown)
             stops.append(n)
             insides.append(jnp.zeros_like(n, bool))
         join = lambda x: jnp.concatenate(x) if x else jnp.zeros(0, int)
@@ -50,6 +51,10 @@ class Rows(eqx.Module):
     def known_after(self, number: Int[Array, " rows"]) -> "Rows":
         """The same, of which each is known after another number of steps."""
         return eqx.tree_at(lambda self: self.known, self, number)
+
+    def at_times(self, time: Float[Array, " rows"]) -> "Rows":
+        """The same, of which the times have been found."""
+        return eqx.tree_at(lambda self: self.time, self, time)
 
     def found(self, stop: Array, inside: Array) -> "Rows":
         """The same, of which the steps have been found."""

@@ -67,7 +67,8 @@ def run(problem: Problem, kept: AbstractTrack | None = None):
         if at_steps is not None:
             if not problem.steps.are_known:
                 found, at_steps = at_steps
-                rows = rows.found(*found)
+                ends = not rows.may_be_inside
+                rows = rows.at_times(found) if ends else rows.found(*found)
             values, each = at_steps
             good = jnp.all(each | ~rows.taken(progress.n))
             if inside is not None:
@@ -103,6 +104,13 @@ def _tracks(
         return None, None
     y, output = problem.start[0], functions.outputs[i]
     init, due = output(problem.steps.t0, y), rows.reached(problem.last)
+    if not (problem.steps.are_known or rows.may_be_inside):
+        at_end = lambda j, point: (
+            problem.steps.begin(rows.stop[j], point),
+            problem.output(i, functions, j, point),
+        )
+        stops, init = (rows.stop, due, problem.last + 1), (init, jnp.asarray(True))
+        return Track(*stops, at_end, (problem.steps.t0, init)), None
     if not problem.steps.are_known:
         found = lambda j, n, inside, point: problem.output(
             i, functions, j, point, found=(n, inside)
