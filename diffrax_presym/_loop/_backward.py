@@ -158,19 +158,13 @@ class Backward(eqx.Module):
         return BackwardState(n, point, bar, gradient, at.tracks, ends)
 
     def row(self, i: int, row: Array, pred: Any) -> PyTree:
-        """The cotangent of one row of an output, or zero."""
-        return self._row(self.saved_bars[i][1], row, pred)
-
-    def time(self, i: int, row: Array, pred: Any) -> Array:
-        """The cotangent of its time."""
-        return self._row(self.saved_bars[i][0], row, pred)
-
-    def _row(self, bars: PyTree, row: Array, pred: Any) -> PyTree:
-        return jtu.tree_map(lambda x: jnp.where(pred, x[row], 0), bars)
+        """The cotangents of the time and the value of one row of an output, or zero."""
+        return jtu.tree_map(lambda x: jnp.where(pred, x[row], 0), self.saved_bars[i])
 
     def _pull_point(self, i: int, n: Array, point: Point, bar: PyTree):
         """Pull back an output saved at a step, to the functions and the state."""
         (y, carry), time = point, self.problem.steps.begin(n, point)
+        _, bar = bar  # Both ends of a solve are given.
         output = lambda functions, y: functions.outputs[i](time, y)
         gradient, y_bar = self.pull(output, bar, y)
         return gradient, (y_bar, _zeros(carry))
@@ -219,17 +213,11 @@ class PullRows(AbstractPull):
         taken = rows.stop[j] >= 0
         if (stencils := problem.stencils[i]) is not None:
             taken &= ~stencils.ways.interpolated
-        row = int(problem.subs[i].t0) + j
-        bar: PyTree = backward.row(i, row, taken)
-        # Where steps end depends on the states before them.
-        depends = not (problem.steps.are_known or rows.may_be_inside)
-        if depends:
-            bar = backward.time(i, row, taken), bar
+        bar = backward.row(i, int(problem.subs[i].t0) + j, taken)
 
         def pull(shorter: bool):
             def output(functions: Functions, start: Point):
-                saved = problem.output(i, functions, j, start, shorter)[0]
-                return (problem.steps.begin(at.n, start), saved) if depends else saved
+                return problem.output(i, functions, j, start, shorter)[:2]
 
             return backward.pull(output, bar, at.point)
 
@@ -265,7 +253,7 @@ class PullNodes(AbstractPull):
             gradient, low, j, bars = x
             j = j - 1
             taken = (rows.stop[j] >= 0) & self.stencils.ways.interpolated
-            bar = backward.row(i, int(problem.subs[i].t0) + j, taken)
+            _, bar = backward.row(i, int(problem.subs[i].t0) + j, taken)
             # Of the others nothing may fail of which a gradient takes zero times.
             time = jnp.where(taken, rows.time[j], problem.steps.t0)
             y = jtu.tree_map(lambda x: x[j], backward.trace.between[i][1])

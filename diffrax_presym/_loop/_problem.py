@@ -167,15 +167,13 @@ class Problem(eqx.Module):
         start: Point,
         shorter: bool | None = None,
         found: tuple[Array, Array] | None = None,
-    ) -> PyTree:
-        """What output `i` saves in row `j`, from the state at the start of its step,
-        and whether that is finite. Which step it is, and whether the row is inside of
-        it, is `found` if the steps are not known beforehand."""
+    ) -> tuple[Array, PyTree, Array]:
+        """The time and the value that output `i` saves in row `j`, from the state at
+        the start of its step, and whether that is finite. Which step it is, and whether
+        the row is inside of it, is `found` if the steps are not known beforehand."""
         rows, y = self.rows[i], start[0]
         n, inside = (rows.stop[j], rows.inside[j]) if found is None else found
-        time = rows.time[j]
+        time = rows.time[j] if rows.has_times else self.steps.begin(n, start)
         if rows.may_be_inside:
             y = self.between(functions, n, start, time, inside, shorter)
-        elif not self.steps.are_known:
-            time = self.steps.begin(n, start)
-        return functions.outputs[i](time, y), tree.all_finite(y)
+        return time, functions.outputs[i](time, y), tree.all_finite(y)

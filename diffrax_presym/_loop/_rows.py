@@ -12,8 +12,7 @@ from ._steps import Steps
 class Rows(eqx.Module):
     """What one of `SaveAt(subs=...)` saves between the ends of a solve, in order."""
 
-    # Not a number where it is that of a step whose end is not known beforehand.
-    time: Float[Array, " rows"]
+    time: Float[Array, " rows"]  # zero until it is found, unless it `has_times`
     # The step from whose start it is computed; -1 if its time is not a number, a gap in
     # measured times, for which nothing is saved.
     stop: Int[Array, " rows"]
@@ -21,10 +20,13 @@ class Rows(eqx.Module):
     known: Int[Array, " rows"]  # the number of steps after which it is known
     of_ts: Bool[Array, " rows"]  # whether it is of `ts`
     may_be_inside: bool = eqx.field(static=True)
+    # Not if they are at the ends of steps that are not known beforehand.
+    has_times: bool = eqx.field(static=True)
 
     def __init__(self, sub: dfx.SubSaveAt, steps: AbstractSteps, max_steps: int | None):
         times, stops, insides = [], [], []
         self.may_be_inside = sub.ts is not None and len(sub.ts) > 0
+        self.has_times = steps.are_known or not sub.steps
         if sub.ts is not None:
             times.append(sub.ts)
             gap, (stop, inside) = jnp.isnan(sub.ts), steps.locate(sub.ts)
@@ -34,7 +36,7 @@ class Rows(eqx.Module):
         if sub.steps:
             assert max_steps is not None  # As has been checked.
             n = sub.steps * jnp.arange(1, max_steps // sub.steps + 1)
-            unknown = jnp.full(n.shape, jnp.nan, steps.t0.dtype)
+            unknown = jnp.zeros(n.shape, steps.t0.dtype)
             times.append(steps.time(n) if isinstance(steps, Steps) else unknown)
             stops.append(n)
             insides.append(jnp.zeros_like(n, bool))
@@ -52,7 +54,7 @@ class Rows(eqx.Module):
         """The same, of which each is known after another number of steps."""
         return eqx.tree_at(lambda self: self.known, self, number)
 
-    def at_times(self, time: Float[Array, " rows"]) -> "Rows":
+    def at(self, time: Float[Array, " rows"]) -> "Rows":
         """The same, of which the times have been found."""
         return eqx.tree_at(lambda self: self.time, self, time)
 

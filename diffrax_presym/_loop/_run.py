@@ -6,6 +6,7 @@ one to the next without asking. Between steps the solution is interpolated from 
 of several, or a shorter step of the scheme.
 """
 
+from functools import partial
 from typing import Any
 
 import diffrax as dfx
@@ -65,10 +66,12 @@ def run(problem: Problem, kept: AbstractTrack | None = None):
     for i, (at_steps, inside) in enumerate(stacked):
         values, ys, rows = None, None, problem.rows[i]
         if at_steps is not None:
-            if not problem.steps.are_known:
+            if not rows.has_times:
+                time, *at_steps = at_steps
+                rows = rows.at(time)
+            elif not problem.steps.are_known:
                 found, at_steps = at_steps
-                ends = not rows.may_be_inside
-                rows = rows.at_times(found) if ends else rows.found(*found)
+                rows = rows.found(*found)
             values, each = at_steps
             good = jnp.all(each | ~rows.taken(progress.n))
             if inside is not None:
@@ -104,22 +107,16 @@ def _tracks(
         return None, None
     y, output = problem.start[0], functions.outputs[i]
     init, due = output(problem.steps.t0, y), rows.reached(problem.last)
-    if not (problem.steps.are_known or rows.may_be_inside):
-        at_end = lambda j, point: (
-            problem.steps.begin(rows.stop[j], point),
-            problem.output(i, functions, j, point),
-        )
-        stops, init = (rows.stop, due, problem.last + 1), (init, jnp.asarray(True))
-        return Track(*stops, at_end, (problem.steps.t0, init)), None
+    saved = partial(problem.output, i, functions)
+    stops = rows.stop, due, problem.last + 1
+    if not rows.has_times:
+        return Track(*stops, saved, (problem.steps.t0, init, jnp.asarray(True))), None
     if not problem.steps.are_known:
-        found = lambda j, n, inside, point: problem.output(
-            i, functions, j, point, found=(n, inside)
-        )
+        found = lambda j, n, inside, point: saved(j, point, found=(n, inside))[1:]
         return Timed(rows.time, found, (init, jnp.asarray(True))), None
     if stencils is not None:
-        due &= stencils.ways.others
-    value = lambda j, point: problem.output(i, functions, j, point)
-    stops = rows.stop, due, problem.last + 1
+        stops = rows.stop, due & stencils.ways.others, problem.last + 1
+    value = lambda j, point: saved(j, point)[1:]
     at_steps = Track(*stops, value, (init, jnp.asarray(True)))
     if stencils is None:
         return at_steps, None
