@@ -115,3 +115,39 @@ def test_a_step_whose_inverse_ends_elsewhere():
         assert short.result == dfx.RESULTS.successful
     assert results[0] == dfx.RESULTS.successful
     assert "inverse of a step" in dfx.RESULTS[results[1]]
+
+
+def test_a_step_of_no_length():
+    solver, y0 = dps.Strang(), (jnp.array([0.6, 0.0, -0.8]), jnp.array([0.4, 1.0, 0.3]))
+
+    def momentum(p):
+        carry = solver.init(SPHERE, 0.0, 0.0, y0, None)
+        (q, p), *_, result = solver.step(
+            SPHERE, 0.0, 0.0, (y0[0], p), None, carry, False
+        )
+        return p, (q, result)
+
+    p, (q, result) = momentum(y0[1])
+    assert result == dfx.RESULTS.successful
+    np.testing.assert_allclose(q, y0[0], atol=1e-15)
+    np.testing.assert_allclose(p, y0[1], atol=1e-15)
+    # The derivative is that of the projection to the tangent space.
+    slope, _ = jax.jacrev(momentum, has_aux=True)(y0[1])
+    np.testing.assert_allclose(slope, np.eye(3) - np.outer(q, q), atol=1e-15)
+
+
+def test_gradients_in_the_loop_of_diffrax_are_finite():
+    # One in twenty was not a number: that of the largest entry of a position.
+    weight = lambda t, q, args: G * q[2]
+    sphere = dps.ManifoldSystem(dps.Sphere(), weight, dps.ConstantDamping(0.2))
+    held = dps.ConstrainedSystem(sphere, lambda t, q, args: q[1] - 0.3 * jnp.cos(t))
+    q, p = jnp.array([0.6, 0.3, -0.7]), jnp.array([0.3, -0.8, 0.6])
+    direction = jnp.array([0.3, -0.2, 0.5])
+
+    def end(x):
+        y0 = held.project(0.0, (q, p + x * direction))
+        args = held, dps.Strang(), 0.0, 0.6, 0.05, y0
+        return jnp.sum(diffeqsolve(*args, max_steps=50).ys[1])
+
+    slopes = jax.jit(lambda xs: jax.lax.map(jax.grad(end), xs))
+    assert jnp.all(jnp.isfinite(slopes(jnp.linspace(-0.5, 0.5, 401))))

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
@@ -186,6 +187,9 @@ class ConstrainedSystem(AbstractSystem):
     def is_small(self, t: Time, q: Q, unit: Scalar, args: PyTree) -> Callable:
         """Whether multipliers move positions by no more than rounding, to the power of
         2/3, of a unit."""
+        # XLA may compute a maximum and its entry apart, with other rounding. Then the
+        # derivative of the maximum is not a number.
+        unit = lax.stop_gradient(unit)
         normal, eps = self.normal(t, q, args), float(jnp.finfo(unit.dtype).eps)
         move = lambda x: tree.largest(self.velocity(t, q, normal(x), args))
         return lambda x: move(x) <= eps ** (2 / 3) * unit

@@ -95,7 +95,12 @@ class ConstrainedSplit(AbstractSplit):
         ahead = tree.values(moved(like)[0])
         unit = jnp.maximum(tree.largest(q), tree.largest(ahead))
         small = term.is_small(t, q, unit, args)
-        miss = lambda x: term.value(t + h, tree.values(moved(x)[0]), args)
+
+        def miss(x: Multipliers) -> Multipliers:
+            # In no time they move nothing.
+            value = term.value(t + h, tree.values(moved(x)[0]), args)
+            return jnp.where(h == 0, x, value)
+
         x, found = find_root(miss, like, small, term.linear_solver)
         y = moved(x)
         if self.base.kick_by != "force" or term.check_inverse:
