@@ -240,6 +240,18 @@ def test_arguments():
     body = dps.ManifoldSystem(dps.Attitude(INERTIA), flat)
     with pytest.raises(ValueError, match=r"The state must be a pair.*Write"):
         body.project(0.0, (jnp.ones(4), jnp.ones(4)))
+    shapes = [
+        (dps.Attitude(INERTIA), (5,), (3,)),
+        (dps.Attitude(jnp.ones((2, 3))), (4,), (3,)),
+        (dps.Attitude(jnp.ones((2, 3))), (5, 4), (5, 3)),
+        (dps.Stiefel(), (2, 4, 3), (2, 4, 3)),
+        (dps.Stiefel(), (2, 4), (2, 4)),
+        (dps.Stiefel(), (4,), (4,)),
+        (dps.Sphere(), (), ()),
+    ]
+    for manifold, q, p in shapes:
+        with pytest.raises(ValueError, match=r"The state must be a pair.*Write"):
+            dps.ManifoldSystem(manifold, flat).project(0.0, (jnp.ones(q), jnp.ones(p)))
     entries = dps.ConstantDamping(jnp.array([0.1, 0.2, 0.3]))
     rough = dps.ManifoldSystem(dps.Sphere(), flat, entries)
     y0 = jnp.array([1.0, 0.0, 0.0]), jnp.zeros(3)

@@ -54,8 +54,11 @@ class Attitude(AbstractManifold):
     def mass(self) -> Inexact[Array, "..."]:
         return self.inertia
 
-    def momenta(self, q: tuple[int, ...]) -> tuple[int, ...]:
-        return (*q[:-1], 3)
+    def momenta(self, q: tuple[int, ...]) -> tuple[int, ...] | None:
+        shape, own = (*q[:-1], 3), jnp.shape(self.inertia)
+        sizes = zip(own[::-1], shape[::-1], strict=False)
+        fits = len(own) <= len(shape) and all(n in (1, m) for n, m in sizes)
+        return shape if fits and q[-1:] == (4,) else None
 
     def flow(self, q: Array, p: Array, s: Array) -> Both:
         inverse = jnp.broadcast_to(1 / cast_to(self.inertia, p), p.shape)

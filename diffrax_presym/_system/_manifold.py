@@ -140,8 +140,9 @@ class ManifoldSystem(AbstractSystem):
             raise ValueError(
                 "The state must be a pair `(q, p)` of floating arrays for each "
                 "manifold of `ManifoldSystem`, of one shape, but for an `Attitude` "
-                f"quaternions and three momenta each. Got {describe(y)}. Write "
-                "`y0=(q0, p0)`."
+                "quaternions and three momenta for each body of its `inertia`, and for "
+                "a `Stiefel` one matrix with no more columns than rows. Got "
+                f"{describe(y)}. Write `y0=(q0, p0)`."
             )
 
     def violation(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:

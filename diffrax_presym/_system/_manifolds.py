@@ -44,8 +44,9 @@ class AbstractManifold(eqx.Module):
         zero, one = jnp.zeros((), p.dtype), jnp.ones((), p.dtype)
         return jax.jvp(lambda s: self.flow(q, p, s), (zero,), (one,))[1]
 
-    def momenta(self, q: tuple[int, ...]) -> tuple[int, ...]:
-        """The shape of the momenta of positions of a shape. By default the same."""
+    def momenta(self, q: tuple[int, ...]) -> tuple[int, ...] | None:
+        """The shape of the momenta of positions of a shape, by default the same; `None`
+        if positions do not have that shape."""
         return q
 
 
@@ -99,6 +100,9 @@ class Sphere(AbstractManifold):
     is_free: ClassVar[bool] = False
     mass: ClassVar[float] = 1.0
 
+    def momenta(self, q: tuple[int, ...]) -> tuple[int, ...] | None:
+        return q or None
+
     def flow(self, q: Array, p: Array, s: Array) -> Both:
         speed = size(p)
         c, d = jnp.cos(s * speed), s * sinc(s * speed)
@@ -123,6 +127,9 @@ class Stiefel(AbstractManifold):
 
     is_free: ClassVar[bool] = False
     mass: ClassVar[float] = 1.0
+
+    def momenta(self, q: tuple[int, ...]) -> tuple[int, ...] | None:
+        return q if len(q) == 2 and q[0] >= q[1] else None
 
     def flow(self, q: Array, p: Array, s: Array) -> Both:
         expm, a, k = jax.scipy.linalg.expm, q.T @ p, q.shape[1]
