@@ -1,5 +1,5 @@
-"""Systems of rigid bodies, on spheres and of orthonormal matrices, and their solutions
-by SciPy on the equations in rotation matrices or with multipliers."""
+"""Systems of rigid bodies, on spheres, of orthonormal matrices and of rods, and their
+solutions by SciPy on the equations in rotation matrices or with multipliers."""
 
 from functools import cache
 from typing import Any
@@ -252,6 +252,18 @@ def flat(case, y):
 @cache
 def exact(case):
     return by_scipy(CASES[case][2], flat(case, start(case)), 2.0)
+
+
+def bobs(angles):
+    """The places of the bobs of a chain of rods of length one."""
+    rods = np.stack([np.sin(angles), -np.cos(angles)], axis=1)
+    return jnp.asarray(np.cumsum(rods, axis=0))
+
+
+def links(t, q, args):
+    """The constraints of such a chain."""
+    each = jnp.diff(jnp.concatenate([jnp.zeros((1, 2)), q]), axis=0)
+    return jnp.sum(each**2, axis=1) - 1
 
 
 def by_scipy(field, y0, t1):

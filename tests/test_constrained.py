@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from on_manifolds import by_scipy, end_as_vector as end
+from on_manifolds import bobs, by_scipy, end_as_vector as end, links
 
 import diffrax_presym as dps
 
@@ -168,6 +168,27 @@ def test_gradient(friction, gradient):
 
 
 # What is saved.
+
+
+STEPS = [10_000, pytest.param(1_000_000, marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize("steps", STEPS)
+def test_constraints_hold_to_rounding(steps):
+    free = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), lambda t, q, args: G * jnp.sum(q[:, 1])
+    )
+    system = dps.ConstrainedSystem(free, links)
+    y0 = bobs(np.array([2.0, 2.5])), jnp.zeros((2, 2))
+    worst = lambda t, y, args: (system.violation(t, *y), system.energy(t, *y))
+    violation, energy = diffeqsolve(
+        *(system, dps.Strang(), 0.0, steps * 1e-3, 1e-3, y0),
+        saveat=dfx.SaveAt(ts=jnp.linspace(0.0, steps * 1e-3, 1001), fn=worst),
+        adjoint=dps.FixedStepAdjoint(),
+        max_steps=None,
+    ).ys
+    assert np.max(violation) < 1e-13
+    assert np.max(np.abs(energy - energy[0])) < 1e-2
 
 
 def test_saved_values_satisfy_the_constraints():

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import pytest
+from on_manifolds import bobs, links
 
 import diffrax_presym as dps
 from diffrax_presym._system import _multipliers
@@ -18,16 +19,6 @@ diffeqsolve: Any = dfx.diffeqsolve
 G = 9.81
 FREE = dps.MechanicalSystem(dps.QuadraticKinetic(), lambda t, q, args: G * q[2])
 SPHERE = dps.ConstrainedSystem(FREE, lambda t, q, args: q @ q - 1)
-
-
-def bobs(angles):
-    rods = np.stack([np.sin(angles), -np.cos(angles)], axis=1)
-    return jnp.asarray(np.cumsum(rods, axis=0))
-
-
-def links(t, q, args):
-    each = jnp.diff(jnp.concatenate([jnp.zeros((1, 2)), q]), axis=0)
-    return jnp.sum(each**2, axis=1) - 1
 
 
 @pytest.mark.variants(1)
