@@ -7,7 +7,7 @@ import numpy as np
 from problems_variable import MOON
 
 
-def found():
+def has_rebound():
     return importlib.util.find_spec("rebound") is not None
 
 
@@ -27,7 +27,7 @@ def simulation(masses, q, v, epsilon):
 
 def ias15(problem, ts):
     """A solve by REBOUND, by the tolerance; `None` where it does not apply."""
-    if not found():
+    if not has_rebound():
         return None
     q0, p0 = map(np.asarray, problem.y0)
     if problem.name == "Pleiades":

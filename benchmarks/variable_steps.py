@@ -27,7 +27,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _ias15 import found, ias15, simulation
+from _ias15 import has_rebound, ias15, simulation
 from _plot import colors, FOLDER, panels, save
 from _report import command_line, Table
 from _schemes import DIFFRAX, SCHEMES
@@ -126,7 +126,7 @@ def burrau(quick):
     runs = [("Dopri8", 1e-13), ("BlanesCasasRKN8", 0.05)]
     epsilons = (0.1,) if quick else (0.1, 0.05, 0.02)
     runs += [("the same, Compensated", x) for x in epsilons]
-    runs += [("IAS15", 1e-9), ("IAS15", 1e-12)] if found() else []
+    runs += [("IAS15", 1e-9), ("IAS15", 1e-12)] if has_rebound() else []
     for name, parameter in runs:
         q, p, steps = to_sixty(system, y0, name, parameter)
         drift = abs(float(system.energy(0.0, q, p)) - float(system.energy(0.0, *y0)))
@@ -168,7 +168,7 @@ def runs_of(problem, ts):
 
 
 def speed(quick):
-    if found():
+    if has_rebound():
         print(f"REBOUND {importlib.metadata.version('rebound')}")
     else:
         print("REBOUND is not installed: IAS15 is omitted.")
