@@ -106,14 +106,24 @@ def _adaptive(problem, n, y0):
     return [(sol.ts, sol.ys)], sol.result
 
 
-def _step_density(problem, n, y0):
-    density = lambda t, y, args: (
-        1 / (1 + 0.2 * sum(jnp.sum(x**2) for x in jax.tree.leaves(y[0])))
-    )
-    controller = dps.StepDensityController(problem.length(n), density)
-    ts = dfx.SaveAt(t1=True)
-    sol = problem.solve(None, y0, ts, stepsize_controller=controller)
-    return [(sol.ts, sol.ys)], sol.result
+def _step_density(saveat):
+    def run(problem, n, y0):
+        density = lambda t, y, args: (
+            1 / (1 + 0.2 * sum(jnp.sum(x**2) for x in jax.tree.leaves(y[0])))
+        )
+        controller = dps.StepDensityController(problem.length(n), density)
+        options = {"stepsize_controller": controller}
+        sol = problem.solve(None, y0, saveat(problem), **options)
+        if not isinstance(sol.ts, list):
+            return [(sol.ts, sol.ys)], sol.result
+        return list(zip(sol.ts, sol.ys, strict=True)), sol.result
+
+    return run
+
+
+def _times_and_steps(problem):
+    times = dfx.SubSaveAt(ts=problem.times(IRREGULAR))
+    return dfx.SaveAt(subs=[times, dfx.SubSaveAt(steps=3, t1=True)])
 
 
 def _chunks(problem, n, y0):
@@ -167,7 +177,8 @@ def _dense(problem, n, y0):
 
 
 _at_times = _saved(lambda problem: dfx.SaveAt(ts=problem.times(IRREGULAR)))
-_at_end = _saved(lambda _: dfx.SaveAt(t1=True))
+_last = lambda _: dfx.SaveAt(t1=True)
+_at_end = _saved(_last)
 
 WAYS = [
     Way("Diffrax's loop, end", _at_end, own=False),
@@ -175,12 +186,13 @@ WAYS = [
     Way("Diffrax's loop, dense", _dense, own=False),
     Way("Diffrax's loop, chunks", _chunks, own=False),
     Way("HalfSolver", _adaptive, own=False, equal=False, order=False),
-    Way("step density", _step_density, own=False, equal=False),
+    Way("Diffrax's loop, density", _step_density(_last), own=False, equal=False),
     Way("end", _at_end),
     Way("every second step", _saved(lambda _: dfx.SaveAt(steps=2)), end=False),
     Way("times", _at_times),
     Way("everything", _everything),
     Way("unequal steps", _unequal, prescribed=True, equal=False),
+    Way("step density", _step_density(_times_and_steps), equal=False),
     Way("chunks", _chunks),
     Way("backwards", _backwards, end=False, backwards=True),
     Way("batch", _batch, end=False),
