@@ -58,6 +58,19 @@ def test_multipliers_by_pivots(n):
     np.testing.assert_allclose(matrix @ solution, np.arange(1.0, n + 1), atol=1e-11)
 
 
+@pytest.mark.parametrize("n", [2, 6, 24])
+def test_diagonals_by_pivots(n):
+    """The same of neighbours, and derivatives by the transposed system."""
+    rng, near = np.random.default_rng(n), np.eye(n, k=1) + np.eye(n, k=-1)
+    matrix, b = rng.standard_normal((n, n)) * near, jnp.arange(1.0, n + 1)
+    product = lambda x: jnp.asarray(matrix) @ x
+    solution = lambda b: _multipliers.solve(product, b, lx.Tridiagonal())
+    np.testing.assert_allclose(matrix @ solution(b), b, atol=1e-10)
+    slope = jax.grad(lambda b: solution(b) @ b**2)(jnp.ones(n))
+    wanted = np.linalg.solve(matrix.T, np.ones(n)) + 2 * np.linalg.solve(matrix, b**0)
+    np.testing.assert_allclose(slope, wanted, rtol=1e-9)
+
+
 def test_a_linear_system_that_is_not_solved_is_one_member_of_a_batch():
     """NaN in derivatives too, where Lineax itself raises an error for all."""
     solver = lx.GMRES(1e-12, 1e-12, max_steps=4, restart=2)

@@ -28,6 +28,8 @@ def solve(
 ) -> Multipliers:
     """The solution of a linear system, by its matrix unless a solver is given; NaN if
     there is none."""
+    if isinstance(solver, lx.Tridiagonal):
+        return lax.custom_linear_solve(linear, b, _tridiagonal, _tridiagonal)
     if solver is None and b.size <= _MOST_ELIMINATED:
         return lax.custom_linear_solve(linear, b, _eliminate, _eliminate)
     operator = lambda linear, like: _operator(linear, like, solver)
@@ -43,13 +45,6 @@ def _operator(
     like: jax.ShapeDtypeStruct,
     solver: lx.AbstractLinearSolver | None,
 ) -> lx.AbstractLinearOperator:
-    if isinstance(solver, lx.Tridiagonal):
-        # Each row couples three neighbours, so three products show all entries.
-        row = jnp.arange(like.size)
-        products = jax.vmap(lambda k: linear((row % 3 == k).astype(like.dtype)))
-        columns = products(jnp.arange(3))
-        lower, diagonal, upper = (columns[(row + k) % 3, row] for k in (-1, 0, 1))
-        return lx.TridiagonalLinearOperator(diagonal, lower[1:], upper[:-1])
     if solver is None:
         return lx.MatrixLinearOperator(_matrix(linear, like))
     return lx.FunctionLinearOperator(linear, like)
@@ -71,6 +66,37 @@ def _eliminate(linear: LinearMap, b: Multipliers) -> Multipliers:
 
     start = jnp.concatenate([matrix, b[:, None]], axis=1)
     return lax.fori_loop(0, b.size, step, start)[:, -1]
+
+
+def _tridiagonal(linear: LinearMap, b: Multipliers) -> Multipliers:
+    """By elimination of the lower diagonal, with pivots."""
+    # Each row couples three neighbours, so three products show all entries.
+    row = jnp.arange(b.size)
+    products = jax.vmap(lambda k: linear((row % 3 == k).astype(b.dtype)))
+    columns = products(jnp.arange(3))
+    diagonals = [columns[(row + k) % 3, row] for k in (-1, 0, 1)]
+    zero = jnp.zeros((), b.dtype)
+
+    def eliminate(row, after):
+        """The pivot of a row and the next, and the other less its first entry."""
+        before, swap = (*row[:2], zero, row[2]), jnp.abs(after[0]) > jnp.abs(row[0])
+        either = lambda x, y: [jnp.where(swap, *z) for z in zip(x, y, strict=True)]
+        pivot, other = either(after, before), either(before, after)
+        factor = other[0] / pivot[0]
+        rest = [y - factor * x for x, y in zip(pivot[1:], other[1:], strict=True)]
+        return tuple(rest), tuple(pivot)
+
+    def substitute(x, pivot):
+        first, second, third, value = pivot
+        found = (value - second * x[0] - third * x[1]) / first
+        return (found, x[0]), found
+
+    # A row has entries in three columns from its own on. Before the first one is that
+    # of a multiplier that is zero.
+    end, pivots = lax.scan(eliminate, (zero + 1, zero, zero), (*diagonals, b))
+    last = end[2] / end[0]
+    x = lax.scan(substitute, (last, zero), pivots, reverse=True)[1]
+    return jnp.append(x[1:], last)
 
 
 def is_regular(
