@@ -21,6 +21,8 @@ _MOST_STEPS = 12
 # On a CPU XLA makes one function of a loop, unless it calls LAPACK: with 3 and 10
 # constraints that is 8 and 2 times slower, with 20 it is faster.
 _MOST_ELIMINATED = 16
+# Of the rows of diagonals at once, as an iteration of a loop takes as long as a row.
+_ROWS = 4
 
 
 def solve(
@@ -93,9 +95,11 @@ def _tridiagonal(linear: LinearMap, b: Multipliers) -> Multipliers:
 
     # A row has entries in three columns from its own on. Before the first one is that
     # of a multiplier that is zero.
-    end, pivots = lax.scan(eliminate, (zero + 1, zero, zero), (*diagonals, b))
+    start = zero + 1, zero, zero
+    end, pivots = lax.scan(eliminate, start, (*diagonals, b), unroll=_ROWS)
     last = end[2] / end[0]
-    x = lax.scan(substitute, (last, zero), pivots, reverse=True)[1]
+    start = last, zero
+    x = lax.scan(substitute, start, pivots, reverse=True, unroll=_ROWS)[1]
     return jnp.append(x[1:], last)
 
 
