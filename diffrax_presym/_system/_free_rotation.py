@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Inexact
 
 from .._numbers import cast_to
-from ._manifolds import inner, sinc
+from ._manifolds import inner, once, sinc
 
 
 Vectors = Inexact[Array, "... 3"]
@@ -95,11 +95,15 @@ def _elliptic(s: Array, alpha: Array, beta: Array) -> Three:
     S = s * series
     C, D = jnp.sqrt(1 - alpha * S**2), jnp.sqrt(1 - beta * S**2)
     c, d = alpha * S**2 / (1 + C), beta * S**2 / (1 + D)
-    for _ in range(_DOUBLINGS):
+
+    def double(_, x: Three) -> Three:
+        S, c, d = x
         twice = 2 * S / (1 - product * S**4)
         C, D = 1 - c, 1 - d
-        S, c, d = twice * C * D, twice * S * D**2 * alpha, twice * S * C**2 * beta
-    return S, c, d
+        return twice * C * D, twice * S * D**2 * alpha, twice * S * C**2 * beta
+
+    # In a loop, as `once`.
+    return lax.fori_loop(0, _DOUBLINGS, double, (S, c, d))
 
 
 def _momentum(p: Three, rates: Three, s: Array) -> Three:
@@ -138,7 +142,7 @@ def _rotation(p: Vectors, rates: Vectors, s: Array) -> tuple[Quaternions, Vector
     is_small = _is_small(p, rates, s)
     start, each = _entries(p), _entries(rates)
     momentum = lambda x: _momentum(start, each, x * s)
-    later = jax.vmap(momentum)(cast_to(_TIMES, p))
+    later = once(jax.vmap(momentum)(cast_to(_TIMES, p)))
     middle, end = (_each(lambda x, i=i: x[i], later) for i in (len(_NODES) // 2, -1))
 
     def rate(later: Three) -> tuple[Array, Array]:
@@ -149,7 +153,7 @@ def _rotation(p: Vectors, rates: Vectors, s: Array) -> tuple[Quaternions, Vector
         square = jnp.where(is_small, 1, _dot(middle, middle))
         return _dot(both, velocity) / product, _dot(turning, turning) / square
 
-    rates_at, turned = jax.vmap(rate)(later)
+    rates_at, turned = once(jax.vmap(rate)(later))
     mean = jnp.tensordot(cast_to(_WEIGHTS, p), rates_at[:-1], 1)
     too_far = s**2 * jnp.max(turned, axis=0) > np.pi**2
 
@@ -158,7 +162,7 @@ def _rotation(p: Vectors, rates: Vectors, s: Array) -> tuple[Quaternions, Vector
 
     half = _each(about, start, end, middle, each)
     angle = jnp.sqrt(_dot(half, half))
-    turn = jnp.cos(angle), _each(lambda x: x * sinc(angle), half)
+    turn = once((jnp.cos(angle), _each(lambda x: x * sinc(angle), half)))
 
     def shortest(x: Three, y: Three) -> tuple[Array, Three]:
         real = jnp.where(is_small, 1, _dot(middle, _each(jnp.add, x, y)))
@@ -168,8 +172,7 @@ def _rotation(p: Vectors, rates: Vectors, s: Array) -> tuple[Quaternions, Vector
 
     turn = _product(shortest(middle, start), _product(turn, shortest(end, middle)))
     turn = jnp.where(too_far[..., None], jnp.nan, _stacked(*turn))
-    # Or XLA on a CPU computes them again for each use of an entry.
-    return lax.optimization_barrier((turn, jnp.stack(end, axis=-1)))
+    return once((turn, jnp.stack(end, axis=-1)))
 
 
 @_rotation.def_jvp
@@ -187,7 +190,7 @@ def _rotation_jvp(primals, tangents):
     def momentum(p: Vectors, rates: Vectors, s: Array) -> Vectors:
         return jnp.stack(_momentum(_entries(p), _entries(rates), s), axis=-1)
 
-    _, dend = jax.jvp(momentum, primals, (dp, drates, ds))
+    dend = once(jax.jvp(momentum, primals, (dp, drates, ds))[1])
     work = s * p * rates * dp + ds * rates * end**2
     if tangents[1] is not None:
         nodes = jax.vmap(lambda x: momentum(p, rates, x * s))(cast_to(_TIMES[:-1], p))
@@ -200,9 +203,10 @@ def _rotation_jvp(primals, tangents):
     angle = s / 2 * rates * (p + end)
     dangle = s * rates * (dp + dend) + (s * drates + ds * rates) * (p + end)
     small = dangle / 2 - jnp.cross(angle, dangle) / 4
-    theta = jnp.where(is_small, small, (along + jnp.cross(end, change)) / square)
+    theta = (along + jnp.cross(end, change)) / square
+    theta = once(jnp.where(is_small, small, theta))
     half = jnp.concatenate([jnp.zeros_like(theta[..., :1]), theta / 2], axis=-1)
-    return (turn, end), lax.optimization_barrier((multiply(turn, half), dend))
+    return (turn, end), once((multiply(turn, half), dend))
 
 
 def free_rotation(p: Vectors, rates: Vectors, s: Array) -> tuple[Quaternions, Vectors]:
