@@ -79,8 +79,9 @@ CONSTRAINT_NOT_SOLVED = _entry(
     "constraint_not_solved",
     "Newton's method did not find the multipliers of the constraints in a step: the "
     "step is too long for the curvature of the constraint, the state left the finite "
-    "numbers, or the constraints are redundant, which `system.project(t0, y0, args)` "
-    "detects. Take shorter steps.",
+    "numbers, the constraints are redundant, which `system.project(t0, y0, args)` "
+    "detects, or with `lineax.Tridiagonal()` more than neighbours are coupled. Take "
+    "shorter steps, or the default `linear_solver=None`.",
 )
 NOT_REVERSIBLE = _entry(
     "constraint_not_reversible",

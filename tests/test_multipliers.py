@@ -21,7 +21,7 @@ FREE = dps.MechanicalSystem(dps.QuadraticKinetic(), lambda t, q, args: G * q[2])
 SPHERE = dps.ConstrainedSystem(FREE, lambda t, q, args: q @ q - 1)
 
 
-@pytest.mark.variants(1)
+@pytest.mark.variants(2)
 @pytest.mark.parametrize("n", [12, 1, 2])
 def test_the_diagonals_of_a_chain_are_its_matrix(n):
     free = dps.MechanicalSystem(
@@ -69,6 +69,27 @@ def test_diagonals_by_pivots(n):
     slope = jax.grad(lambda b: solution(b) @ b**2)(jnp.ones(n))
     wanted = np.linalg.solve(matrix.T, np.ones(n)) + 2 * np.linalg.solve(matrix, b**0)
     np.testing.assert_allclose(slope, wanted, rtol=1e-9)
+
+
+def test_links_that_friction_joins_are_no_chain():
+    """Three diagonals are not their matrix, so steps fail, with an error that says it.
+    The same with a mass."""
+    n = 4
+    joined = jnp.eye(2 * n) + 0.03 * (jnp.eye(2 * n, k=2) + jnp.eye(2 * n, k=-2))
+    y0 = jnp.ravel(bobs(np.linspace(1.0, 1.5, n))), jnp.zeros(2 * n)
+    weight = lambda t, q, args: G * jnp.sum(q[1::2])
+    chain = lambda t, q, args: links(t, q.reshape(-1, 2), args)
+
+    def result(solver, mass=None, friction=None):
+        free = dps.MechanicalSystem(dps.QuadraticKinetic(mass), weight, friction)
+        system = dps.ConstrainedSystem(free, chain, linear_solver=solver)
+        args = system, dps.Strang(), 0.0, 0.5, 0.05, y0
+        return diffeqsolve(*args, throw=False).result
+
+    for parts in ({"mass": joined}, {"friction": dps.ViscousDamping(joined)}):
+        assert result(None, **parts) == dfx.RESULTS.successful
+        failure = result(lx.Tridiagonal(), **parts)
+        assert "default `linear_solver=None`" in dfx.RESULTS[failure]
 
 
 def test_a_linear_system_that_is_not_solved_is_one_member_of_a_batch():

@@ -170,3 +170,18 @@ def test_gradients_of_the_ends_of_steps_and_of_their_times(way):
     many = jnp.stack([AT, 1.1 * AT])
     each = [jax.grad(fn)(x) for x in many]
     np.testing.assert_allclose(jax.vmap(jax.grad(fn))(many), each, rtol=1e-10)
+
+
+def test_the_time_at_which_the_most_steps_end_has_derivatives():
+    """It depends on the states, unlike the end of a complete solve."""
+    saveat = dfx.SaveAt(t1=True, fn=lambda t, y, args: t**2)
+
+    def end(q, adjoint):
+        options = {"saveat": saveat, "max_steps": 20, "throw": False}
+        y0 = q, START[1]
+        sol = solve(kepler(), 0.1, [9.0], adjoint, y0=y0, **options)
+        return sol.ts[-1] + sol.ys[-1]
+
+    own, other = (jax.grad(end)(START[0], adjoint) for adjoint in (OWN, THEIRS))
+    assert jnp.max(jnp.abs(other)) > 0.1
+    np.testing.assert_allclose(own, other, rtol=1e-9)

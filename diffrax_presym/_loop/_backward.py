@@ -163,11 +163,13 @@ class Backward(eqx.Module):
 
     def _pull_point(self, i: int, n: Array, point: Point, bar: PyTree):
         """Pull back an output saved at a step, to the functions and the state."""
-        (y, carry), time = point, self.problem.steps.begin(n, point)
-        _, bar = bar  # Both ends of a solve are given.
-        output = lambda functions, y: functions.outputs[i](time, y)
-        gradient, y_bar = self.pull(output, bar, y)
-        return gradient, (y_bar, _zeros(carry))
+
+        def output(functions: Functions, point: Point):
+            # A solve that `max_steps` ends may do so at a time that depends on states.
+            time = self.problem.steps.begin(n, point)
+            return time, functions.outputs[i](time, point[0])
+
+        return self.pull(output, bar, point)
 
 
 class AbstractPull(eqx.Module):

@@ -81,7 +81,8 @@ class ConstrainedSystem(AbstractSystem):
             constraints hold, or a scalar.
         - `linear_solver`: a Lineax solver for the multipliers. Defaults to `None`, by
             their matrix. For a chain, in which constraints share coordinates with their
-            neighbours alone, the cost of `lineax.Tridiagonal()` is linear.
+            neighbours alone, and neither mass nor friction joins others, the cost of
+            `lineax.Tridiagonal()` is linear.
         - `check_inverse`: whether steps are also inverted, and fail if that ends
             elsewhere: for Monte Carlo methods. It doubles the cost. Defaults to
             `False`.
@@ -248,7 +249,9 @@ class ConstrainedSystem(AbstractSystem):
 
 _REDUNDANT = (
     "The constraints are redundant: at this state their gradients are linearly "
-    "dependent. Omit those that follow from the others."
+    "dependent. Omit those that follow from the others. With `lineax.Tridiagonal()` "
+    "also those of a chain whose mass joins more than neighbours: use the default "
+    "`linear_solver=None`."
 )
 _TOO_FAR = (
     "`project` did not find positions that satisfy the constraints. Start nearer to "

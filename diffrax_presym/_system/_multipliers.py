@@ -30,9 +30,10 @@ def solve(
 ) -> Multipliers:
     """The solution of a linear system, by its matrix unless a solver is given; NaN if
     there is none."""
-    if isinstance(solver, lx.Tridiagonal):
+    # Scans of length one fail within `eqx.error_if`, where XLA evaluates constants.
+    if isinstance(solver, lx.Tridiagonal) and b.size > 1:
         return lax.custom_linear_solve(linear, b, _tridiagonal, _tridiagonal)
-    if solver is None and b.size <= _MOST_ELIMINATED:
+    if b.size <= (_MOST_ELIMINATED if solver is None else 1):
         return lax.custom_linear_solve(linear, b, _eliminate, _eliminate)
     operator = lambda linear, like: _operator(linear, like, solver)
     return solve_linear(linear, b, lx.LU() if solver is None else solver, operator)
@@ -71,12 +72,19 @@ def _eliminate(linear: LinearMap, b: Multipliers) -> Multipliers:
 
 
 def _tridiagonal(linear: LinearMap, b: Multipliers) -> Multipliers:
-    """By elimination of the lower diagonal, with pivots."""
-    # Each row couples three neighbours, so three products show all entries.
+    """By elimination of the lower diagonal, with pivots; NaN if other entries are not
+    zero, as with masses or friction that join links."""
+    # Each row couples three neighbours, so three products show all entries, and another
+    # one whether these are all.
     row = jnp.arange(b.size)
-    products = jax.vmap(lambda k: linear((row % 3 == k).astype(b.dtype)))
-    columns = products(jnp.arange(3))
-    diagonals = [columns[(row + k) % 3, row] for k in (-1, 0, 1)]
+    probe = jnp.cos(row.astype(b.dtype))
+    each = [*((row % 3 == k).astype(b.dtype) for k in range(3)), probe]
+    *columns, product = jax.vmap(linear)(jnp.stack(each))
+    diagonals = [jnp.stack(columns)[(row + k) % 3, row] for k in (-1, 0, 1)]
+    neighbours = [jnp.roll(probe, -k) for k in (-1, 0, 1)]
+    known = sum(x * y for x, y in zip(diagonals, neighbours, strict=True))
+    unit = float(jnp.finfo(b.dtype).eps) ** 0.5 * tree.largest(diagonals)
+    are_all = tree.largest(product - known) <= unit
     zero = jnp.zeros((), b.dtype)
 
     def eliminate(row, after):
@@ -100,7 +108,7 @@ def _tridiagonal(linear: LinearMap, b: Multipliers) -> Multipliers:
     last = end[2] / end[0]
     start = last, zero
     x = lax.scan(substitute, start, pivots, reverse=True, unroll=_ROWS)[1]
-    return jnp.append(x[1:], last)
+    return jnp.where(are_all, jnp.append(x[1:], last), jnp.nan)
 
 
 def is_regular(
