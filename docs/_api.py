@@ -23,7 +23,7 @@ NAMES = re.findall(
     "\n".join(x.read_text() for x in PAGES),
     re.MULTILINE,
 )
-# Code that is a name, or a call of it, and no link yet.
+# Code that is a name, or a call of it, and no link or heading.
 CODE = re.compile(r'(?<!">)<code>(?P<name>[\w.]+)(?:\([^<]*)?</code>')
 # What a worker of a browser has.
 WORKER = """

@@ -3,7 +3,7 @@
 A build needs no network, so the pages on which they are documented are listed here.
 """
 
-import re
+from _api import CODE
 
 
 KIDGER = "https://docs.kidger.site/{project}/api/{page}/#{project}.{name}"
@@ -12,8 +12,7 @@ PAGES = {
     "diffrax": {
         "adjoints": "BacksolveAdjoint ForwardMode RecursiveCheckpointAdjoint",
         "diffeqsolve": "diffeqsolve",
-        "events": "Event",
-        "saveat": "SaveAt SubSaveAt",
+        "saveat": "SaveAt",
         "solution": "RESULTS Solution",
         "solvers/ode_solvers": "Dopri5 Dopri8 Euler Kvaerno5 SemiImplicitEuler Tsit5",
         "solvers/sde_solvers": "HalfSolver",
@@ -48,8 +47,6 @@ def urls():
 
 
 URLS = dict(urls())
-# Code that is a name, or a call of it, and no link or heading.
-CODE = re.compile(r'(?<!">)<code>(?P<name>[\w.]+)(?:\([^<]*)?</code>')
 
 
 def on_page_content(content, **kwargs):

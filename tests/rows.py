@@ -37,7 +37,7 @@ def possible(row: dict) -> bool:
     if way is not None and way.backwards and friction.limit is not None:
         return False
     if way is not None and way.name == "step density" and "multistep" in scheme.name:
-        return False
+        return False  # its history is of equal steps
     if way is not None and way.name == "HalfSolver" and scheme.name == "Tao":
         return False  # its docstring says why
     if row.get("precision") == "float32" and friction.double:

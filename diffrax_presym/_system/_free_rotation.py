@@ -102,7 +102,7 @@ def _elliptic(s: Array, alpha: Array, beta: Array) -> Three:
         C, D = 1 - c, 1 - d
         return twice * C * D, twice * S * D**2 * alpha, twice * S * C**2 * beta
 
-    # In a loop, as `once`.
+    # By a loop, or XLA on a CPU computes all of them again for each use.
     return lax.fori_loop(0, _DOUBLINGS, double, (S, c, d))
 
 

@@ -35,22 +35,14 @@ def solve(
         return lax.custom_linear_solve(linear, b, _tridiagonal, _tridiagonal)
     if b.size <= (_MOST_ELIMINATED if solver is None else 1):
         return lax.custom_linear_solve(linear, b, _eliminate, _eliminate)
-    operator = lambda linear, like: _operator(linear, like, solver)
-    return solve_linear(linear, b, lx.LU() if solver is None else solver, operator)
+    if solver is None:
+        operator = lambda *x: lx.MatrixLinearOperator(_matrix(*x))
+        return solve_linear(linear, b, lx.LU(), operator)
+    return solve_linear(linear, b, solver)
 
 
 def _matrix(linear: LinearMap, like: Any) -> Inexact[Array, "constraints constraints"]:
     return jax.vmap(linear, out_axes=1)(jnp.eye(like.size, dtype=like.dtype))
-
-
-def _operator(
-    linear: LinearMap,
-    like: jax.ShapeDtypeStruct,
-    solver: lx.AbstractLinearSolver | None,
-) -> lx.AbstractLinearOperator:
-    if solver is None:
-        return lx.MatrixLinearOperator(_matrix(linear, like))
-    return lx.FunctionLinearOperator(linear, like)
 
 
 def _eliminate(linear: LinearMap, b: Multipliers) -> Multipliers:
