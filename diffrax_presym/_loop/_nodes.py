@@ -107,12 +107,16 @@ class Stencils(eqx.Module):
     def combine(self, j: Array, ring: Node) -> State:
         """The state in row `j`, from a ring of nodes."""
 
+        # Each index once: XLA takes long to compile many of them.
+        at = lambda x, i: lax.dynamic_index_in_dim(x, i, keepdims=False)
+        weights, first = at(self.weights, j), self.first[j]
+        places = [(first + i) % NODES for i in range(NODES)]
+
         def leaf(*data: Array) -> Array:
             total = jnp.zeros(data[0].shape[1:], data[0].dtype)
-            for i in range(NODES):
+            for i, place in enumerate(places):
                 for order, x in enumerate(data):
-                    weight = cast_to(self.weights[j, i, order], x)
-                    total = total + weight * x[(self.first[j] + i) % NODES]
+                    total = total + cast_to(weights[i, order], x) * at(x, place)
             return total
 
         return jtu.tree_map(leaf, *ring)

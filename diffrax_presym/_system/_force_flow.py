@@ -46,25 +46,28 @@ def force_flow(
     pade = [math.comb(k, j) / math.comb(2 * k, j) * x for j, x in enumerate(taylor, 1)]
     at_end = [(-1) ** j * x for j, x in enumerate(pade)]
     series = lambda weights, x: functools.reduce(tree.add, map(tree.scale, weights, x))
-    end = lambda p: series(at_end, _derivatives(force, p, k))
+    # A gradient computes them again: to keep all that they consist of takes three times
+    # as long to compile.
+    derivatives = lambda p: _derivatives(force, p, k)
+    derivatives = jax.checkpoint(derivatives, prevent_cse=False)
+    end = lambda p: series(at_end, derivatives(p))
     # Traced once, with all that it depends on, to be differentiated.
-    end, known = eqx.filter_closure_convert(end, p), _derivatives(force, p, k)
+    end, known = eqx.filter_closure_convert(end, p), derivatives(p)
     equation, guess = _Equation(p, series(pade, known), end), series(taylor, known)
     return implicit(equation, guess, find=_iterate, tangent=contract)
 
 
 def _derivatives(force: _Force, p: PyTree, number: int) -> list[PyTree]:
     """A force and its derivatives along the motion of the momentum by it."""
-
-    def along(fn: _Force, p: PyTree) -> PyTree:
-        _, change = jax.jvp(fn, (p,), (force(p),))
-        # Of a speed, at rest, it is not finite, and nothing else is known of it.
-        return jtu.tree_map(lambda x: jnp.where(jnp.isfinite(x), x, 0), change)
-
-    functions = [force]
-    for _ in range(number - 1):
-        functions.append(functools.partial(along, functions[-1]))
-    return [fn(p) for fn in functions]
+    if number == 1:
+        return [force(p)]
+    # Each with one derivative more, of which the first is that of the force: evaluated
+    # one by one, their derivatives would have half as much code again.
+    lower = lambda p: _derivatives(force, p, number - 1)
+    (known, *_), changes = jax.jvp(lower, (p,), (force(p),))
+    # Of a speed, at rest, it is not finite, and nothing else is known of it.
+    finite = lambda x: jnp.where(jnp.isfinite(x), x, 0)
+    return [known, *jtu.tree_map(finite, changes)]
 
 
 _NEGLIGIBLE = 1 / 8  # largest estimated change of another iteration to stop
