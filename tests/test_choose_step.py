@@ -244,6 +244,12 @@ def test_tolerances_that_cannot_be_reached(
         choose(system_of(potential), solver, *LONG, tolerance, max_steps)
 
 
+def test_a_solve_that_takes_too_few_steps():
+    solve = solve_of(PENDULUM, RKN6, *LONG, max_steps=100)
+    with pytest.raises(RuntimeError, match=r"than the solve takes.*Let the"):
+        dps.choose_step(solve, 0.0, 20.0, rtol=1e-9, atol=1e-9)
+
+
 def test_what_does_not_converge_ends_soon():
     # Chaotic: no two solves agree.
     chaotic = system_of(lambda t, q, args: cosine(t, q, args) * (1 + jnp.cos(t)), 0.0)
@@ -280,7 +286,7 @@ def between(times):
 TWICE = jax.vmap(lambda h: solve_of(PENDULUM, RKN6, *LONG)(h), None, axis_size=2)
 
 
-@pytest.mark.variants(17)
+@pytest.mark.variants(18)
 @pytest.mark.parametrize(
     "changes, message",
     [
@@ -289,6 +295,7 @@ TWICE = jax.vmap(lambda h: solve_of(PENDULUM, RKN6, *LONG)(h), None, axis_size=2
         ({"atol": float("nan")}, "atol=.* but got nan"),
         ({"atol": "small"}, "atol=.* but got 'small'"),
         ({"max_steps": 0}, "max_steps=.* must be a positive integer, but got 0"),
+        ({"first": -1.0}, "first=.* must be a positive number, but got -1.0"),
         ({"t0": 20.0, "t1": 0.0}, "`t0` and `t1` must be those"),
         ({"solve": lambda h: solve_of(PENDULUM, RKN6, *LONG)(0.1)}, "not use `dt0`"),
         ({"t1": 0.0}, "two different finite times"),

@@ -223,6 +223,31 @@ def test_a_density_without_a_rate_at_the_start():
     assert_close(last(sol.ys)[0], Y0[1] * np.sin(1.0), 1e-3)
 
 
+@pytest.mark.parametrize("throw", [False, True])
+def test_epsilon_is_found_in_any_unit_of_time(throw):
+    def chosen(unit, **first):
+        orbit = dps.MechanicalSystem(
+            dps.QuadraticKinetic(),
+            lambda t, q, args: -(unit**-2) / jnp.linalg.norm(q),
+        )
+        run = lambda epsilon: solve(
+            *(control(epsilon, orbit), dps.TunedRKN6(), 0.0, 4 * PERIOD * unit),
+            *((Y0[0], Y0[1] / unit), orbit),
+            saveat=dfx.SaveAt(t1=True, fn=lambda t, y, args: y[0]),
+            adjoint=dps.FixedStepAdjoint(),
+            throw=throw,
+        )
+        tolerances = {"rtol": 1e-5, "atol": 1e-5, "max_steps": 5000}
+        return dps.choose_step(run, 0.0, 4 * PERIOD * unit, **tolerances, **first)
+
+    one, *others = [chosen(unit, first=1.0) for unit in (1.0, 1e-6, 1e7)]
+    assert one.error <= 1 and 50 < one.steps < 500
+    assert all(x.steps == one.steps for x in others)
+    # By the span, which is a million times too long: more than the steps allowed.
+    by_span = chosen(1e7)
+    assert by_span.error <= 1 and abs(by_span.steps - one.steps) < 0.3 * one.steps
+
+
 def by_own_loop(solver, **options):
     adjoint = dps.FixedStepAdjoint()
     return solve(CONTROL, solver, 0.0, 1.0, Y0, adjoint=adjoint, **options)

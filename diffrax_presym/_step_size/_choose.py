@@ -6,7 +6,7 @@ import jax
 from jaxtyping import Array, ArrayLike, Float
 
 from ._convergence import find_steps, Trial
-from ._solution import check_times, check_tolerance, Solution
+from ._solution import check_number, check_times, Solution
 
 
 class ChosenStep(NamedTuple):
@@ -67,6 +67,7 @@ def choose_step(
     *,
     rtol: float,
     atol: float,
+    first: ArrayLike | None = None,
     max_steps: int = 1_000_000,
     on_trial: Callable[[Trial], Any] | None = None,
 ) -> ChosenStep:
@@ -92,7 +93,7 @@ def choose_step(
 
     A parameter that scales steps is found in the same way, such as `epsilon` of
     `StepDensityController`: what `solve` is given is then not a step, but the number of
-    steps that it takes falls as that grows.
+    steps that it takes falls as that grows. Say where to begin: `first=1.0`.
 
     The step divides the span. A saved time inside of a step costs a step more, unless
     `FixedStepAdjoint` interpolates it. So if the saved times are on a grid that divides
@@ -130,6 +131,8 @@ def choose_step(
     - `rtol`, `atol`: the relative and the absolute tolerance, not negative and not
         both zero. The latter in the units of the state: entries that pass through zero
         need one.
+    - `first`: of a parameter that is not a step, the value that is tried first, one for
+        which a solve takes few steps, or fails. Defaults to a quarter of `t1 - t0`.
     - `max_steps`: the largest number of steps of a trial solve. That is about four
         times the number of steps that can be chosen. If three doublings in succession,
         from 2000 steps or a 500th of it on, bring the tolerance no closer, it is an
@@ -157,8 +160,8 @@ def choose_step(
         )
     t0, t1 = check_times(t0, t1, "choose_step")
     tolerances = (
-        check_tolerance(rtol, "choose_step(rtol=...)"),
-        check_tolerance(atol, "choose_step(atol=...)"),
+        check_number(rtol, "choose_step(rtol=...)"),
+        check_number(atol, "choose_step(atol=...)"),
     )
     if not any(tolerances):
         raise ValueError(
@@ -177,7 +180,10 @@ def choose_step(
         if on_trial is not None:
             on_trial(trial)
 
-    length = lambda n: jax.device_put((t1 - t0) / n)
+    start = (t1 - t0) / 4
+    if first is not None:
+        start = check_number(first, "choose_step(first=...)", positive=True)
+    length = lambda n: jax.device_put(4 * start / n)
     run = lambda n: Solution.of(n, solve, length(n))
     best, order, claimed, smooth, grid = find_steps(
         run, (t0, t1), tolerances, max_steps, report

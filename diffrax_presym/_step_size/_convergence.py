@@ -21,6 +21,10 @@ AIM, ENOUGH = 0.6, 0.4
 SEEING = 50
 # With fewer steps these may be too long for the motion, and not converge for that.
 PATIENCE = 2000
+# The largest number that is tried, of a parameter whose numbers are not those of steps.
+_MOST = 2**60
+# Among so many numbers the best is chosen.
+_CANDIDATES = 100_000
 
 
 class Trial(NamedTuple):
@@ -120,9 +124,10 @@ def find_steps(
     report: Callable[[Trial], None],
 ) -> Choice:
     law = grid = doubted = None
-    numbers = doubling(4)
-    while (n := next(numbers)) <= max_steps:
+    numbers, expected = doubling(4), float
+    while expected(n := next(numbers)) <= max_steps and n < _MOST:
         finest, last = solve(n), law and law.finest
+        expected = finest.expected
         if grid is None and finest.finite:
             # Of a solve that fails, the saved times are not known.
             grid = Grid.of(finest.ts, *times)
@@ -160,7 +165,7 @@ def find_steps(
             if smooth or doubted:
                 best = _smallest(law, high, grid, measure) if smooth else high
                 more = int(grid.cheaper(np.array([best.number]))[0])
-                if best.number < more <= max_steps:
+                if best.number < more and expected(more) <= max_steps:
                     finer = measure(more)
                     best = finer if finer.error <= 1 else best
                 return choice._replace(best=best)
@@ -200,8 +205,9 @@ def _smallest(law: Law, high: Trial, grid: Grid, measure) -> Trial:
     low = too_few[-1] if too_few else Trial(0, math.inf, 0)
     steepest, failed = 1.5 * (law.claimed or 20), False
     for _ in range(6):
-        numbers = np.unique(grid.cheaper(np.arange(low.number + 1, high.number)))
-        numbers = numbers[numbers < high.number]
+        between = np.linspace(low.number + 1, high.number - 1, _CANDIDATES).astype(int)
+        numbers = np.unique(grid.cheaper(np.unique(between)))
+        numbers = numbers[(numbers > low.number) & (numbers < high.number)]
         if high.error >= ENOUGH or not numbers.size:
             break
         # By the law of convergence, between the two on a log scale. Where the larger
@@ -271,7 +277,18 @@ def _exceeds(law: Law | None, max_steps: int, needed: float = math.inf) -> str:
         f"with {last.steps} steps the error is {last.error:.1e} times the tolerance, "
         f"and the measured order {order:.1f}{claimed}"
     )
-    if not last.error < math.inf:
+    finite = [x for x in law.ladder if x.error < math.inf]
+    if finite and finite[-1] is not last:
+        what, best = "needs more steps than the solve takes", finite[-1]
+        found = (
+            f"with {best.steps} steps the error is {best.error:.1e} times the "
+            "tolerance, and solves with more steps fail"
+        )
+        advice = (
+            "Let the solve take more, `diffeqsolve(..., max_steps=...)`, or use a "
+            "larger tolerance."
+        )
+    elif not finite:
         what, found = "found no finite solution", f"with up to {tried} steps"
         advice = (
             "Check that the solution exists up to `t1`, that the force is finite along "
@@ -288,9 +305,10 @@ def _exceeds(law: Law | None, max_steps: int, needed: float = math.inf) -> str:
     else:
         about = f"about {needed:.1e}, more" if needed < math.inf else "more"
         what = f"needs {about} than {max_steps} steps (`max_steps`)"
+        high = (law.claimed or order) >= 5
+        scheme = "" if high else "a scheme of higher order, "
         advice = (
-            "Use a scheme of higher order, for example `TunedRKN6()`, a larger "
-            "tolerance, or allow more steps: `max_steps=...`."
+            f"Use {scheme}a larger tolerance, or let it take more: `max_steps=...`."
         )
     return f"`choose_step` {what}: {found}. {advice}"
 

@@ -11,6 +11,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+from .._results import STEP_DENSITY_MISSED
+
 
 class Solution(NamedTuple):
     """What a solve saved, on the host."""
@@ -22,6 +24,13 @@ class Solution(NamedTuple):
     finite: bool
     order: int | None  # of the scheme, if that is known
     interpolates: bool = False  # between steps, at no cost
+    missed: bool = False  # whether its steps were far from what their density asks for
+
+    def expected(self, number: int) -> float:
+        """The steps that a solve of another number takes, by this one."""
+        if self.missed:
+            return 0  # Of a parameter the number is not one of steps, and this is few.
+        return number * self.steps / self.number if self.finite else number
 
     @classmethod
     def of(cls, number: int, solve: Callable[[Array], Any], step) -> "Solution":
@@ -43,7 +52,8 @@ class Solution(NamedTuple):
                 ) from None
             if "EquinoxRuntimeError" not in text:
                 raise
-            return cls(number, number, np.zeros(0), [], False, None)
+            missed = dfx.RESULTS[STEP_DENSITY_MISSED] in text
+            return cls(number, number, np.zeros(0), [], False, None, missed=missed)
         finally:
             logger.disabled = disabled
         if not isinstance(sol, dfx.Solution):
@@ -80,6 +90,7 @@ class Solution(NamedTuple):
             finite,
             None if order is None else int(order),
             bool(sol.stats.get("interpolated", False)),
+            bool(sol.result == STEP_DENSITY_MISSED),
         )
 
 
@@ -119,14 +130,13 @@ def check_times(t0, t1, name: str) -> tuple[float, float]:
     return float(t0), float(t1)
 
 
-def check_tolerance(x, name: str) -> float:
+def check_number(x, name: str, positive: bool = False) -> float:
     check_concrete(x, f"`{name}`")
     try:
         value = float(x)
     except (TypeError, ValueError):
         value = math.nan
-    if not 0 <= value < math.inf:
-        raise ValueError(
-            f"`{name}` must be a number that is not negative, but got {x!r}."
-        )
+    if not 0 <= value < math.inf or (positive and value == 0):
+        wanted = "a positive number" if positive else "a number that is not negative"
+        raise ValueError(f"`{name}` must be {wanted}, but got {x!r}.")
     return value

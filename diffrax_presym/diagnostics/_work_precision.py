@@ -10,8 +10,8 @@ import jax
 import numpy as np
 
 from .._step_size._solution import (
+    check_number,
     check_times,
-    check_tolerance,
     scaled_error,
     Solution,
 )
@@ -138,8 +138,8 @@ def work_precision(
     """
     t0, t1 = check_times(t0, t1, "work_precision")
     tolerance = (
-        check_tolerance(rtol, "work_precision(rtol=...)"),
-        check_tolerance(atol, "work_precision(atol=...)"),
+        check_number(rtol, "work_precision(rtol=...)"),
+        check_number(atol, "work_precision(atol=...)"),
     )
     if not solves or not any(tolerance):
         raise ValueError(
