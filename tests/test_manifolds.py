@@ -263,3 +263,25 @@ def test_arguments():
     ):
         with pytest.raises(ValueError, match="must be at one rate"):
             diffeqsolve(system, solver, 0.0, 1.0, 0.1, y0)
+
+
+def test_velocities_of_bodies():
+    from scipy.spatial.transform import Rotation
+
+    omega, v = np.array([0.3, -0.8, 0.6]), np.array([1.0, 2.0, -1.0])
+    parts = {"turn": dps.Attitude(jnp.asarray(INERTIA)), "place": dps.Euclidean(2.0)}
+    free = dps.ManifoldSystem(parts, lambda t, q, args: 0.0)
+    held = dps.ConstrainedSystem(free, lambda t, q, args: q["place"][2:])
+    q0 = {"turn": jnp.array([0.6, 0.0, 0.8, 0.0]), "place": jnp.zeros(3)}
+    velocities = {"turn": jnp.asarray(omega), "place": jnp.asarray(v)}
+    for system in (free, held):
+        y = system.from_velocity(0.0, (q0, velocities))
+        back = system.to_velocity(0.0, y)[1]
+        for part, velocity in velocities.items():
+            np.testing.assert_allclose(back[part], velocity, atol=1e-14)
+    # By the rotation over a short time, along the axes of the body.
+    y, h = free.from_velocity(0.0, (q0, velocities)), 1e-4
+    q, _ = diffeqsolve(free, dps.Strang(), 0.0, h, h, y).ys
+    turned = Rotation.from_matrix(matrix(q0["turn"]).T @ matrix(q["turn"][-1]))
+    np.testing.assert_allclose(turned.as_rotvec() / h, omega, atol=1e-3)
+    np.testing.assert_allclose(q["place"][-1] / h, v, rtol=1e-10)

@@ -136,6 +136,12 @@ class ConstrainedSystem(AbstractSystem):
     def velocity(self, t: Time, q: Q, p: P, args: PyTree = None) -> Q:
         return self.system.velocity(t, q, p, args)
 
+    def from_velocity(self, t: Time, y: tuple[Q, P], args: PyTree = None) -> State:
+        return self.system.from_velocity(t, y, args)
+
+    def to_velocity(self, t: Time, y: State, args: PyTree = None) -> tuple[Q, P]:
+        return self.system.to_velocity(t, y, args)
+
     # The constraint.
 
     @property

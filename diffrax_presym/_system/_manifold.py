@@ -13,7 +13,7 @@ from jaxtyping import PyTree
 from .. import _tree as tree
 from .._checks import check_callable, describe, match
 from .._compositions import lengths
-from .._forms import divide
+from .._forms import divide, multiply
 from .._friction._base import AbstractFriction, MASS, Mechanics
 from .._friction._damping import as_laws
 from .._friction._linear import LinearFriction
@@ -163,6 +163,17 @@ class ManifoldSystem(AbstractSystem):
                 "several manifolds."
             )
         return friction
+
+    def from_velocity(self, t: Time, y: tuple[Q, P], args: PyTree = None) -> State:
+        """The state `(q, p)` of positions and velocities `(q, v)`, which of an
+        `Attitude` are angular velocities along the axes of the body."""
+        return y[0], multiply(self.mechanics.mass, y[1], MASS, "v")
+
+    def to_velocity(self, t: Time, y: State, args: PyTree = None) -> tuple[Q, P]:
+        """Positions and velocities `(q, v)` of a state `(q, p)`, of an `Attitude`
+        angular ones along the axes of the body: save them by
+        `SaveAt(..., fn=system.to_velocity)`."""
+        return y[0], self._along_axes(y[1])
 
     # The vector field.
 
