@@ -92,6 +92,98 @@ def test_links_that_friction_joins_are_no_chain():
         assert "default `linear_solver=None`" in dfx.RESULTS[failure]
 
 
+@pytest.mark.parametrize("n", [5, 6])
+def test_a_ring_is_no_chain(n):
+    """Its matrix has two corners, which look like diagonals every third time."""
+    near = np.eye(n, k=1) + np.eye(n, k=-1)
+    corners = np.eye(n, k=n - 1) + np.eye(n, k=1 - n)
+    for entry in (0.0, 1.0):
+        matrix = jnp.asarray(4 * np.eye(n) + near + entry * corners)
+        product = lambda x, matrix=matrix: matrix @ x
+        x = _multipliers.solve(product, jnp.arange(1.0, n + 1), lx.Tridiagonal())
+        assert jnp.all(jnp.isnan(x)) == bool(entry)
+
+
+FRICTIONS = {
+    "none": None,
+    "constant": dps.ConstantDamping(0.5),
+    "by place": dps.ViscousDamping(lambda t, q, args: 0.5 + q[0] ** 2),
+}
+
+
+@pytest.mark.variants(4)
+@pytest.mark.parametrize("kind", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("solver", [dps.Strang(), dps.BlanesMoan4()])
+@pytest.mark.parametrize("friction", FRICTIONS)
+def test_positions_near_the_origin(friction, solver, kind):
+    """Nothing is small there but them: the support of the pendulum is above."""
+    weight = lambda t, q, args: jnp.asarray(G, q.dtype) * q[1]
+    law = FRICTIONS[friction]
+    if friction == "constant":
+        law = dps.ConstantDamping(kind(0.5))
+    free = dps.MechanicalSystem(dps.QuadraticKinetic(), weight, law)
+    held = dps.ConstrainedSystem(
+        free, lambda t, q, args: q[0] ** 2 + q[1] ** 2 - 2 * q[1]
+    )
+
+    def end(x):
+        q0 = jnp.stack([x, 1 - jnp.sqrt(1 - x**2)])
+        y0 = held.project(kind(0), (q0, jnp.zeros(2, kind)))
+        options = {"adjoint": dps.FixedStepAdjoint(), "max_steps": None}
+        args = held, solver, kind(0), kind(20), kind(0.02), y0
+        sol = diffeqsolve(*args, throw=False, **options)
+        q, p = jax.tree.map(lambda y: y[-1], sol.ys)
+        return sol.result == dfx.RESULTS.successful, held.violation(kind(20), q, p)
+
+    good, violation = jax.jit(jax.vmap(end))(jnp.linspace(0.3, 0.7, 32).astype(kind))
+    assert jnp.all(good) and jnp.max(violation) < 20 * float(jnp.finfo(kind).eps)
+
+
+def test_strong_friction_over_a_step():
+    """The motion is slow, and follows the force: `x' = -g sin(x) / rate`."""
+    for rate in (1e4, 1e6, 1e8):
+        free = dps.MechanicalSystem(
+            dps.QuadraticKinetic(),
+            *(lambda t, q, args: G * q[1], dps.ConstantDamping(rate)),
+        )
+        held = dps.ConstrainedSystem(free, lambda t, q, args: q @ q - 1)
+        y0 = jnp.array([0.6, -0.8]), jnp.zeros(2)
+        adjoint = dps.FixedStepAdjoint()
+        q, _ = diffeqsolve(held, dps.Strang(), 0.0, 1.0, 0.02, y0, adjoint=adjoint).ys
+        # A step of `Strang` starts with its force for a half of it.
+        np.testing.assert_allclose(q[-1, 0] - 0.6, -0.6 * 0.8 * G / rate, rtol=0.02)
+
+
+def test_no_constraints():
+    none = dps.ConstrainedSystem(FREE, lambda t, q, args: jnp.zeros(0))
+    y0 = jnp.array([0.6, 0.0, -0.8]), jnp.array([0.4, 1.0, 0.3])
+    np.testing.assert_array_equal(none.project(0.0, y0)[0], y0[0])
+    ends = [
+        diffeqsolve(system, dps.Strang(), 0.0, 1.0, 0.1, y0).ys
+        for system in (none, FREE)
+    ]
+    for end, free in zip(*ends, strict=True):
+        np.testing.assert_allclose(end, free, atol=1e-14)
+
+
+def test_a_force_and_a_part_that_is_not_constrained():
+    """Beside a rod that is held a spring, which does as without the rod."""
+    potential = lambda t, q, args: G * q["rod"][1] + jnp.sum(q["spring"] ** 2)
+    force = lambda t, q, v, args: jax.tree.map(lambda v: -0.4 * jnp.tanh(v), v)
+    free = dps.MechanicalSystem(dps.QuadraticKinetic(), potential, force=force)
+    held = dps.ConstrainedSystem(free, lambda t, q, args: q["rod"] @ q["rod"] - 1)
+    q0 = {"rod": jnp.array([0.6, -0.8]), "spring": jnp.ones(1)}
+    y0 = q0, jax.tree.map(jnp.zeros_like, q0)
+
+    def end(system):
+        q, p = diffeqsolve(system, dps.BlanesMoan4(), 0.0, 1.0, 0.05, y0).ys
+        return q["spring"], p["spring"], jnp.sum(q["rod"] ** 2)
+
+    (*found, length), (*expected, _) = end(held), end(free)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    np.testing.assert_allclose(length, 1.0, rtol=1e-14)
+
+
 def test_a_linear_system_that_is_not_solved_is_one_member_of_a_batch():
     """NaN in derivatives too, where Lineax itself raises an error for all."""
     solver = lx.GMRES(1e-12, 1e-12, max_steps=4, restart=2)

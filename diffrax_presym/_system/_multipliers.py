@@ -30,6 +30,8 @@ def solve(
 ) -> Multipliers:
     """The solution of a linear system, by its matrix unless a solver is given; NaN if
     there is none."""
+    if b.size == 0:
+        return b
     # Scans of length one fail within `eqx.error_if`, where XLA evaluates constants.
     if isinstance(solver, lx.Tridiagonal) and b.size > 1:
         return lax.custom_linear_solve(linear, b, _tridiagonal, _tridiagonal)
@@ -73,7 +75,8 @@ def _tridiagonal(linear: LinearMap, b: Multipliers) -> Multipliers:
     each = [*((row % 3 == k).astype(b.dtype) for k in range(3)), probe]
     *columns, product = jax.vmap(linear)(jnp.stack(each))
     diagonals = [jnp.stack(columns)[(row + k) % 3, row] for k in (-1, 0, 1)]
-    neighbours = [jnp.roll(probe, -k) for k in (-1, 0, 1)]
+    # Those around the ends, the corners of the matrix of a ring, are other entries.
+    neighbours = [jnp.pad(probe, 1)[k : k + b.size] for k in range(3)]
     known = sum(x * y for x, y in zip(diagonals, neighbours, strict=True))
     unit = float(jnp.finfo(b.dtype).eps) ** 0.5 * sum(map(jnp.abs, diagonals))
     are_all = jnp.all(jnp.abs(product - known) <= unit)
@@ -113,28 +116,34 @@ def is_regular(
 
 
 def find_root(
-    residual: LinearMap,
-    like: Multipliers,
-    is_small: Callable[[Multipliers], Bool[Array, ""]],
-    solver: lx.AbstractLinearSolver | None,
+    residual: LinearMap, like: Multipliers, solver: lx.AbstractLinearSolver | None
 ) -> tuple[Multipliers, Bool[Array, ""]]:
-    """The root of a function by Newton's method from zero, and whether it was found:
-    whether a correction became small, so that the error is its square. The derivatives
-    are those of the implicit function."""
+    """The root of a function by Newton's method from zero, and whether it was found.
+    The derivatives are those of the implicit function.
+
+    It was if the derivative of the function did not change over the last correction but
+    one: relative to that, the error that the last leaves is the third power of half of
+    the change. This has no scale, and holds where only rounding is left.
+    """
 
     def newton(residual: LinearMap, x: Multipliers):
         def more(state):
-            _, found, count = state
+            _, found, count, *_ = state
             return ~found & (count < _MOST_STEPS)
 
         def improve(state):
-            x, _, count = state
-            miss, linear = jax.linearize(residual, x)
-            change = solve(linear, miss, solver)
-            return x - change, is_small(change), count + 1
+            x, _, count, change, miss = state
+            new, linear = jax.linearize(residual, x)
+            bend = tree.largest(linear(change) - miss)
+            limit = 2 * float(jnp.finfo(x.dtype).eps) ** (1 / 3)
+            found = bend <= limit * tree.largest(miss)
+            change = solve(linear, new, solver)
+            return x - change, found, count + 1, change, new
 
-        start = x, jnp.array(False), jnp.zeros((), int)
-        x, found, _ = lax.while_loop(more, improve, start)
+        unknown = jnp.full_like(x, jnp.nan)
+        start = x, jnp.array(False), jnp.zeros((), int), unknown, unknown
+        x, found, *_ = lax.while_loop(more, improve, start)
+        found &= jnp.all(jnp.isfinite(x))
         return x, found.astype(x.dtype)  # JAX 0.6 has no derivatives of other types.
 
     tangent = lambda linear, b: solve(linear, b, solver)
