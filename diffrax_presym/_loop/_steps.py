@@ -32,8 +32,11 @@ class StepsBetween(dfx.AbstractStepSizeController):
 
     For a force or friction with kinks at known times, such as a table read by
     `jax.numpy.interp`: a step across a kink has order two at most, steps that end there
-    keep the order of the scheme. The force must be continuous. The steps between two of
-    the times are equal, and as few as are not longer than `dt0`.
+    keep the order of the scheme. Where the force jumps at these times, schemes that
+    take it at the ends of steps have order one: `TunedRKN6`, `BlanesMoanRKN4`,
+    `Strang`, the momentum-first leapfrog and what is composed of them; other schemes
+    keep their order. The steps between two of the times are equal, and as few as are
+    not longer than `dt0`.
 
     !!! example
 

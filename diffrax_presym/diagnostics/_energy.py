@@ -50,7 +50,8 @@ def energy_error(
     damping law. The error is the left side minus the right. The integral is along the
     exact motion from each saved state to the next time, by `diffrax.Dopri8` to
     rounding, so that the error is that of the solution alone. It is NaN where that
-    fails.
+    fails. Where a force has kinks, as of contacts, it may take far longer than the
+    solve.
 
     **Arguments:**
 
@@ -65,7 +66,8 @@ def power_lost(
     system: AbstractSystem, ts: Times, ys: State, args: PyTree = None
 ) -> Times:
     """The power lost to friction at each saved time, `-v · F` with the velocity `v`
-    and the force `F` of all friction: `v · C v` for viscous friction.
+    and the force `F` of all laws of friction: `v · C v` for viscous friction. A
+    `force=` of the system is none of these, and is in `diagnostics.energy_error`.
 
     It follows the saved momenta. Where friction over a step is of the order of one or
     more, those of `Strang`, `PresymplecticLeapfrog` and `PresymplecticEuler` are not
