@@ -256,11 +256,15 @@ class ManifoldSplit(AbstractForceSplit):
     def _stage(self, system, h, data, q, p) -> State:
         term, friction = system.term, system.friction
         if friction is None or not _only_shortens(system):
-            if friction is not None:
-                p = tree.add(p, friction.decay(data[0], p))
             flow = lambda m, q, p: m.flow(q, p, cast_to(h, p))
-            q, p = term.pair(term.map(flow, q, p))
-            return q, p if friction is None else tree.add(p, friction.decay(data[1], p))
+            move = lambda q, p: term.pair(term.map(flow, q, p))
+            if friction is None:
+                return move(q, p)
+            # A gradient computes it again: to keep all that it consists of, at each of
+            # the stages between which friction acts, takes twice as long to compile.
+            move = jax.checkpoint(move, prevent_cse=False)
+            q, p = move(q, tree.add(p, friction.decay(data[0], p)))
+            return q, tree.add(p, friction.decay(data[1], p))
         # Friction at a rate: a shorter time, and a slower motion.
         flow = lambda m, q, p, effect: m.flow(q, p, cast_to(effect.carried, p))
         q, p = term.pair(term.map(flow, q, p, data.leaves))
