@@ -139,9 +139,10 @@ class MatrixFriction(eqx.Module):
         symmetric = (matrix + jnp.swapaxes(matrix, -1, -2)) / 2
         # No more than this, by Gershgorin's circles, which compile in no time. Nothing
         # of the size of the matrix depends on the span.
-        diagonal = jnp.diagonal(symmetric, axis1=-2, axis2=-1)
-        radius = jnp.sum(jnp.abs(symmetric), axis=-1) - jnp.abs(diagonal)
-        forwards, backwards = jnp.max(radius + diagonal), jnp.max(radius - diagonal)
+        diagonal = np.eye(symmetric.shape[-1], dtype=bool)
+        circles = lambda x: jnp.where(diagonal, x, jnp.abs(x))
+        most = lambda x: jnp.max(jnp.sum(circles(x), axis=-1))
+        forwards, backwards = most(symmetric), most(-symmetric)
         return jnp.where(h > 0, forwards, backwards) * jnp.abs(h)
 
     def over(self, t: Time, h: Time) -> Scalar:

@@ -286,6 +286,7 @@ class Steps(AbstractSteps):
     def explain(self, scheme, system, n, ends, result):
         times = [system.time(self.time(i)) for i in (0 * n, n)]
         timed = list(zip(times, ends, strict=True))
+        n = 1 if self._prepares_once(scheme, system) else n  # All steps are alike.
         return explain(scheme, system, partial(self.span, system), n, timed, result)
 
     def growth(self, system, last):
