@@ -100,11 +100,10 @@ def exponentials(
     # Loops rather than code for each term, which takes long to compile.
     next_power = lambda x, _: (_product(x, z), x)
     _, powers = lax.scan(next_power, one, None, length=_TERMS + 1)
-    factorials = np.array([[math.factorial(k + 1) for k in range(_TERMS)]], z.dtype)
+    # x^k / (k + 1)!, by their ratios.
     numbers = np.arange(_TERMS, dtype=z.dtype)[None]
-    # The derivative of a power of exponent zero is NaN at zero.
-    power = jnp.expand_dims(fractions, 1) ** np.maximum(numbers, 1)
-    terms = jnp.where(numbers == 0, 1, power) / factorials
+    ratios = jnp.expand_dims(fractions, 1) / (numbers + 1)
+    terms = jnp.cumprod(jnp.where(numbers == 0, 1, ratios), axis=1)
     combine = lambda c, x: jnp.tensordot(c, x, 1, precision="highest")
     mean = combine(terms, powers[:-1])
     change = combine(fractions[:, None] * terms, powers[1:])
