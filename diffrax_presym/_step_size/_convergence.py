@@ -21,8 +21,6 @@ AIM, ENOUGH = 0.6, 0.4
 SEEING = 50
 # With fewer steps these may be too long for the motion, and not converge for that.
 PATIENCE = 2000
-# The largest number that is tried, of a parameter whose numbers are not those of steps.
-_MOST = 2**60
 # Among so many numbers the best is chosen.
 _CANDIDATES = 100_000
 
@@ -125,7 +123,7 @@ def find_steps(
 ) -> Choice:
     law = grid = doubted = None
     numbers, expected = doubling(4), float
-    while expected(n := next(numbers)) <= max_steps and n < _MOST:
+    while expected(n := next(numbers)) <= max_steps:
         finest, last = solve(n), law and law.finest
         expected = finest.expected
         if grid is None and finest.finite:
@@ -294,6 +292,11 @@ def _exceeds(law: Law | None, max_steps: int, needed: float = math.inf) -> str:
             "Check that the solution exists up to `t1`, that the force is finite along "
             "it, and that the solve allows as many steps (`max_steps=None`)."
         )
+        if law.finest.missed:
+            advice = (
+                "`epsilon` was too large each time, beginning with a quarter of the "
+                "span: say where to begin, `choose_step(..., first=1.0)`."
+            )
     elif not order >= law.least - 0.4:
         what = f"found no regular convergence with up to {tried} steps"
         advice = (

@@ -28,8 +28,6 @@ class Solution(NamedTuple):
 
     def expected(self, number: int) -> float:
         """The steps that a solve of another number takes, by this one."""
-        if self.missed:
-            return 0  # Of a parameter the number is not one of steps, and this is few.
         return number * self.steps / self.number if self.finite else number
 
     @classmethod
