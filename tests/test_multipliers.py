@@ -105,9 +105,9 @@ def test_a_ring_is_no_chain(n):
 
 
 FRICTIONS = {
-    "none": None,
-    "constant": dps.ConstantDamping(0.5),
-    "by place": dps.ViscousDamping(lambda t, q, args: 0.5 + q[0] ** 2),
+    "none": lambda kind: None,
+    "constant": lambda kind: dps.ConstantDamping(kind(0.5)),
+    "by place": lambda kind: dps.ViscousDamping(lambda t, q, args: 0.5 + q[0] ** 2),
 }
 
 
@@ -118,9 +118,7 @@ FRICTIONS = {
 def test_positions_near_the_origin(friction, solver, kind):
     """Nothing is small there but them: the support of the pendulum is above."""
     weight = lambda t, q, args: jnp.asarray(G, q.dtype) * q[1]
-    law = FRICTIONS[friction]
-    if friction == "constant":
-        law = dps.ConstantDamping(kind(0.5))
+    law = FRICTIONS[friction](kind)
     free = dps.MechanicalSystem(dps.QuadraticKinetic(), weight, law)
     held = dps.ConstrainedSystem(
         free, lambda t, q, args: q[0] ** 2 + q[1] ** 2 - 2 * q[1]
