@@ -27,30 +27,25 @@ def gauss_legendre(h: ArrayLike, order: int) -> tuple[Array, Array]:
 
 
 @jax.custom_jvp
-def expm1(x: Numbers) -> Numbers:
-    return jnp.where(jnp.abs(x) < 0.1, x * _series(x), jnp.exp(x) - 1)
+def expm1_and_ratio(x: Numbers) -> tuple[Numbers, Numbers]:
+    small, series, far = jnp.abs(x) < 0.1, _series(x), jnp.exp(x) - 1
+    ratio = jnp.where(small, series, far / jnp.where(small, 1, x))
+    return jnp.where(small, x * series, far), ratio
 
 
-@expm1.defjvp
-def _expm1_jvp(x, dx):
-    # Much shorter than the derivative of the series.
-    value = expm1(*x)
-    return value, (value + 1) * dx[0]
-
-
-@jax.custom_jvp
-def expm1_ratio(x: Numbers) -> Numbers:
-    small = jnp.abs(x) < 0.1
-    return jnp.where(small, _series(x), (jnp.exp(x) - 1) / jnp.where(small, 1, x))
-
-
-@expm1_ratio.defjvp
-def _expm1_ratio_jvp(x, dx):
+@expm1_and_ratio.defjvp
+def _expm1_and_ratio_jvp(x, dx):
     (x,), (dx,) = x, dx
-    value, small = expm1_ratio(x), jnp.abs(x) < 0.1
-    # Each branch is evaluated within its range: outside, it would overflow.
+    (value, ratio), small = expm1_and_ratio(x), jnp.abs(x) < 0.1
+    # Each branch is evaluated within its range: outside, it would overflow. Both are
+    # much shorter than the derivative of the series.
     near, far = jnp.where(small, x, 0), jnp.where(small, 1, x)
-    return value, jnp.where(small, _series(near, 1), (jnp.exp(far) - value) / far) * dx
+    slope = jnp.where(small, _series(near, 1), (jnp.exp(far) - ratio) / far)
+    return (value, ratio), ((value + 1) * dx, slope * dx)
+
+
+def expm1(x: Numbers) -> Numbers:
+    return expm1_and_ratio(x)[0]
 
 
 def _series(x: Numbers, derivative: int = 0) -> Numbers:

@@ -17,7 +17,7 @@ from jaxtyping import Array, ArrayLike, Bool, Inexact
 
 from .._checks import as_parameter
 from .._numbers import as_time, cast_to, Scalar, Time
-from ._exponential import expm1, expm1_ratio, gauss_legendre
+from ._exponential import expm1, expm1_and_ratio, gauss_legendre
 
 
 class Effect(NamedTuple):
@@ -113,9 +113,9 @@ class LinearScale(AbstractLogScale):
 
     def effect(self, rate: Array, t: Time, h: Time, order: int) -> Effect:
         x = cast_to(rate, h := as_time(h)) * h
-        # `-x * ratio` would not be exactly -1 where friction stops the motion.
-        integral = h * expm1_ratio(-x)
-        return Effect(expm1(-x), integral, integral)
+        change, ratio = expm1_and_ratio(-x)
+        integral = h * ratio
+        return Effect(change, integral, integral)
 
 
 # Of the singularity: the momentum left there is less than rounding.
@@ -155,10 +155,10 @@ class Logarithm(AbstractLogScale):
         singular, since = self._since(t)
         start = jnp.where(singular, 0, since)
         x, h, rate = self.increment(t, h), as_time(h), cast_to(rate, since)
-        carried = start * x * expm1_ratio((1 - rate) * x)
+        carried = start * x * expm1_and_ratio((1 - rate) * x)[1]
         # What has no friction is carried from the singularity on too.
         carried = jnp.where(singular & (rate == 0), h, carried)
-        responded = (start + h) * x * expm1_ratio(-(1 + rate) * x)
+        responded = (start + h) * x * expm1_and_ratio(-(1 + rate) * x)[1]
         return Effect(expm1(-rate * x), carried, responded)
 
     def is_singular(self, t: Time) -> Bool[Array, ""]:
