@@ -104,8 +104,12 @@ def contract(g, y: PyTree) -> PyTree:
         solved = (change <= 1 / 8) | (jnp.maximum(change, last) <= small)
         return jtu.tree_map(lambda x: jnp.where(solved, x, jnp.nan), x)
 
-    # JAX asserts that all leaves depend linearly on something, or none: of a constraint
-    # that leaves a part of the state free only some do.
-    total = tree.dot(y, tree.zeros(y))
-    y = jtu.tree_map(lambda x: x + total.astype(x.dtype), y)
-    return lax.custom_linear_solve(g, y, solve, transpose_solve=solve)
+    # JAX asserts that all leaves depend linearly on something, or none, and JAX 0.6
+    # that all are used: of a constraint that leaves a part of the state free only some
+    # do and are.
+    def joined(x: PyTree) -> PyTree:
+        total = tree.dot(x, tree.zeros(x))
+        return jtu.tree_map(lambda x: x + total.astype(x.dtype), x)
+
+    x = lax.custom_linear_solve(g, joined(y), solve, transpose_solve=solve)
+    return joined(x)
