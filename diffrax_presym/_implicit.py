@@ -104,9 +104,8 @@ def contract(g, y: PyTree) -> PyTree:
         solved = (change <= 1 / 8) | (jnp.maximum(change, last) <= small)
         return jtu.tree_map(lambda x: jnp.where(solved, x, jnp.nan), x)
 
-    # JAX asserts that all leaves depend linearly on something, or none, and JAX 0.6
-    # that all are used: of a constraint that leaves a part of the state free only some
-    # do and are.
+    # The transpose asserts that all leaves take part or none, in JAX 0.6 also after the
+    # solve. Of a constraint that leaves a part of the state free some do not.
     def joined(x: PyTree) -> PyTree:
         total = tree.dot(x, tree.zeros(x))
         return jtu.tree_map(lambda x: x + total.astype(x.dtype), x)

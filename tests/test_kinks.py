@@ -132,3 +132,35 @@ def test_steps_between_kinks_are_chosen_and_differentiated():
     along = jnp.array([0.3, -0.2, 0.5, 0.1, -0.4])
     difference = (end(push + 1e-5 * along) - end(push - 1e-5 * along)) / 2e-5
     assert jax.grad(end)(push) @ along == pytest.approx(float(difference), rel=1e-7)
+
+
+# A force that jumps at the end of a step: a scheme that takes it there sees one side,
+# and has order one.
+ORDERS = [
+    (dps.BlanesMoan4(), 3.5, np.inf),
+    (dps.BlanesMoan6(), 5, np.inf),
+    (dps.BlanesMoanRKN6(), 5, np.inf),
+    (dps.PresymplecticGauss(3), 5, np.inf),
+    (dps.PresymplecticLeapfrog("position"), 1.8, np.inf),
+    *((x, 0.7, 1.3) for x in (RKN6, RKN4, dps.Strang(), dps.PresymplecticLeapfrog())),
+]
+
+
+@pytest.mark.variants(9)
+@pytest.mark.parametrize("solver, least, most", ORDERS)
+def test_steps_that_end_where_a_force_jumps(solver, least, most):
+    jump, t1 = 0.9, 2.0
+    push = lambda t: jnp.where(t < jump, 1.0, -1.5)
+    system = system_of(
+        lambda t, q, args: cosine(t, q, None) - push(t) * jnp.sum(q), 0.0
+    )
+    between = {"stepsize_controller": dps.StepsBetween(np.array([jump]))}
+    solve = solve_of(system, solver, 0.0, t1, Y0, **between)
+    y = np.concatenate(Y0)
+    for force, span in ((1.0, (0.0, jump)), (-1.5, (jump, t1))):
+        rhs = lambda t, y, force=force: [*y[2:], *(force - np.sin(y[:2]))]
+        y = scipy.integrate.solve_ivp(rhs, span, y, "DOP853", rtol=1e-13, atol=1e-13)
+        y = y.y[:, -1]
+    ends = [np.concatenate([x[-1] for x in solve(h).ys]) for h in (0.3, 0.15)]
+    first, second = (np.max(np.abs(end - y)) for end in ends)
+    assert least < np.log2(first / second) < most

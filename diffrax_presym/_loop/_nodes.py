@@ -107,7 +107,7 @@ class Stencils(eqx.Module):
     def combine(self, j: Array, ring: Node) -> State:
         """The state in row `j`, from a ring of nodes."""
 
-        # Each index once: XLA takes long to compile many of them.
+        # Each index once, as many of them take long to trace.
         at = lambda x, i: lax.dynamic_index_in_dim(x, i, keepdims=False)
         weights, first = at(self.weights, j), self.first[j]
         places = [(first + i) % NODES for i in range(NODES)]

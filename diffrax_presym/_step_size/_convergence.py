@@ -204,7 +204,7 @@ def _smallest(law: Law, high: Trial, grid: Grid, measure) -> Trial:
     steepest, failed = 1.5 * (law.claimed or 20), False
     for _ in range(6):
         between = np.linspace(low.number + 1, high.number - 1, _CANDIDATES).astype(int)
-        numbers = np.unique(grid.cheaper(np.unique(between)))
+        numbers = np.unique(grid.cheaper(between))
         numbers = numbers[(numbers > low.number) & (numbers < high.number)]
         if high.error >= ENOUGH or not numbers.size:
             break
