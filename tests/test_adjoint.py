@@ -14,6 +14,7 @@ from catalogue import each, pick, Scheme
 from helpers import assert_close
 
 import diffrax_presym as dps
+from diffrax_presym._loop._one_function import as_one_function
 
 
 REVERSIBLE = dps.FixedStepAdjoint()
@@ -243,3 +244,17 @@ def test_bad_options(kwargs):
         dps.FixedStepAdjoint(**kwargs)
     with pytest.raises(ValueError, match="checkpoints"):
         dps.FixedStepAdjoint(checkpoints=-1)
+
+
+def test_loop_of_one_iteration_stays_in_the_compiled_program():
+    def solve(x):
+        outputs = lambda: (jnp.sin(x), 3 * x, dfx.RESULTS.successful, "static")
+        return as_one_function(outputs)
+
+    *values, result, static = solve(jnp.arange(3.0))
+    assert_close(tuple(values), (jnp.sin(jnp.arange(3.0)), 3 * jnp.arange(3.0)), 1e-15)
+    assert result == dfx.RESULTS.successful and static == "static"
+    program = jax.jit(lambda x: solve(x)[:2]).lower(jnp.arange(3.0)).compile()
+    assert "while(" in str(program.as_text())
+    batch = jax.vmap(lambda x: solve(x)[:2])(jnp.arange(6.0).reshape(2, 3))
+    assert_close(batch[1], 3 * jnp.arange(6.0).reshape(2, 3), 1e-15)

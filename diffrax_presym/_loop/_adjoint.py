@@ -16,6 +16,7 @@ from .._system._bound import bind
 from . import _diffrax as private
 from ._backward import Backward
 from ._kept import Checkpoints, Reversal
+from ._one_function import as_one_function
 from ._problem import Problem
 from ._run import run, saved_rows
 from ._steps import Steps, StepsBetween
@@ -250,7 +251,8 @@ def _final_state(problem: Problem, way: Reversal | Checkpoints, init_state, stru
 @eqx.filter_custom_vjp
 def _solve(inputs, way: Reversal | Checkpoints):
     problem, buffers = inputs
-    return _outputs(problem, buffers, run(problem))
+    # With a gradient nothing was gained by that.
+    return as_one_function(lambda: _outputs(problem, buffers, run(problem)))
 
 
 def _outputs(problem: Problem, buffers, out):
