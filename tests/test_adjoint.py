@@ -1,6 +1,7 @@
 """Gradients by running the scheme backwards, against other methods. Those of every
 scheme, friction and way to run are compared with differences by `test_pairs.py`."""
 
+import re
 from typing import Any
 
 import diffrax as dfx
@@ -258,3 +259,25 @@ def test_loop_of_one_iteration_stays_in_the_compiled_program():
     assert "while(" in str(program.as_text())
     batch = jax.vmap(lambda x: solve(x)[:2])(jnp.arange(6.0).reshape(2, 3))
     assert_close(batch[1], 3 * jnp.arange(6.0).reshape(2, 3), 1e-15)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        dict(),
+        dict(solver=dps.SymmetricMultistep(8)),
+        dict(stepsize_controller=dps.StepsBetween(jnp.array([0.31, 0.72]))),
+        dict(
+            dt0=None,
+            stepsize_controller=dps.StepDensityController(0.1, separable(GAMMA)),
+        ),
+    ],
+    ids=["equal steps", "multistep", "steps between", "variable steps"],
+)
+def test_no_operation_keeps_a_loop_from_being_one_function(options):
+    # Those that XLA calls by themselves on a CPU.
+    apart = re.compile(r' (scatter|sort|custom-call)\(.*op_name="[^"]*while/body')
+    options = dict(solver=dps.TunedRKN6(), saveat=dfx.SaveAt(ts=TS)) | options
+    gradient = jax.grad(lambda inputs: value(inputs, dps.FixedStepAdjoint(), options))
+    text = str(jax.jit(gradient).lower(INPUTS).compile().as_text())
+    assert "while" in text and apart.search(text) is None

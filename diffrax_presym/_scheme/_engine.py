@@ -194,7 +194,8 @@ def _prepare(moves: Moves, system: System, span: Span, backward: bool) -> PyTree
         if is_autonomous(move, system):
             lengths = np.round(rows[:, 2], 15)
             _, first, which = np.unique(lengths, return_index=True, return_inverse=True)
-            rows = rows[first]
+            order = np.argsort(first)  # as they come
+            rows, which = rows[first[order]], np.argsort(order)[which]
 
         def one(*row) -> PyTree:
             part = span.part(*row)
@@ -207,12 +208,27 @@ def _prepare(moves: Moves, system: System, span: Span, backward: bool) -> PyTree
             data = jtu.tree_map(lambda x: jnp.expand_dims(x, 0), row)
         else:
             data = jax.vmap(one)(*(cast_to(x, span.h) for x in rows.T))
-        return (
-            jtu.tree_map(lambda x: x[which], data) if len(rows) < len(which) else data
-        )
+        if len(rows) == len(which):
+            return data
+        return jtu.tree_map(lambda x: _rows(x, which.tolist()), data)
 
     columns = zip(moves.moves, np.moveaxis(moves.table, 1, 0), strict=True)
     return [column(*x) for x in columns]
+
+
+def _rows(x: Array, which: list[int]) -> Array:
+    """`x[which]`, by slices: the transpose of an index is a scattered addition, with
+    which XLA does not compile a loop to one function."""
+    parts, i = [], 0
+    while i < len(which):
+        first, down = which[i], which[i + 1 : i + 2] == [which[i] - 1]
+        ahead = enumerate(first - k if down else k - first for k in which[i:])
+        number = next((n for n, k in ahead if k != n), len(which) - i)
+        low = first - number + 1 if down else first
+        part = x[low : low + number]
+        parts.append(jnp.flip(part, 0) if down else part)
+        i += number
+    return jnp.concatenate(parts)
 
 
 def prepare_once(
