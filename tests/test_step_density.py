@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 from helpers import assert_close
 from variable import (
     control,
@@ -45,6 +46,63 @@ def test_the_time_scale_of_a_system():
     q = jnp.array([0.3, 0.4])
     assert_close(scale(KEPLER, 4 * q) / scale(KEPLER, q), 8.0, 1e-12)
     assert_close(scale(KEPLER, q), 5**-0.25 * 0.5**1.5, 1e-12)
+
+
+def test_the_time_scale_where_the_velocity_depends_on_positions():
+    # Kepler in polar coordinates: the acceleration of the distance has L^2 / r^3.
+    mass = lambda r: jnp.array([1.0, 0.0]) + jnp.array([0.0, 1.0]) * r**2
+    energy = lambda t, q, p, args: jnp.sum(p**2 / mass(q[0])) / 2 - 1 / q[0]
+    moved = lambda t, q, args: jnp.diag(mass(q[0]))
+    height = lambda t, q, args: -1 / q[0]
+    q, (radial, L) = jnp.array([1.2, 0.3]), (0.4, 0.9)
+    r = 1.2
+    # Of r'' = L^2 / r^3 - 1 / r^2 and angle'' = -2 L r' / r^3, with the derivatives
+    # by r at constant momenta.
+    slopes = 2 / r**3 - 3 * L**2 / r**4, 6 * L * radial / r**4
+    for system in (dps.Hamiltonian(energy), dps.LagrangianSystem(moved, height)):
+        found = control(1.0, system).density(0.0, (q, jnp.array([radial, L])), None)
+        assert_close(found, sum(x**2 for x in slopes) ** -0.25, 1e-12)
+
+
+# Where the force has no slope, at inflections of the potential: with the position at
+# which the motion starts, at rest.
+INFLECTIONS = {
+    "pendulum": (lambda q: -jnp.cos(q), 2.5),
+    "pendulum that turns there": (lambda q: -jnp.cos(q), np.pi / 2),
+    "Morse": (lambda q: (1 - jnp.exp(-q)) ** 2, 2.0),
+    "double well": (lambda q: q**4 / 4 - q**2 / 2, 1.6),
+    "quartic": (lambda q: q**4 / 4, 1.0),
+}
+
+
+@pytest.mark.parametrize("epsilon", [0.3, 0.05])
+@pytest.mark.parametrize("name", INFLECTIONS)
+def test_one_position_passes_inflections_of_its_potential(name, epsilon):
+    potential, start = INFLECTIONS[name]
+    system = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), lambda t, q, args: jnp.sum(potential(q))
+    )
+    own: dict[str, Any] = dict(system=system, adjoint=dps.FixedStepAdjoint())
+    y0 = jnp.array([start]), jnp.zeros(1)
+    sol = solve(control(epsilon, system), dps.TunedRKN6(), 0.0, 20.0, y0, **own)
+    assert succeeds(sol)
+    force = jax.jit(jax.grad(lambda x: -potential(x)))
+    rhs = lambda t, y: [y[1], float(force(y[0]))]
+    options: dict[str, Any] = dict(rtol=1e-11, atol=1e-11)
+    exact = scipy.integrate.solve_ivp(rhs, (0, 20), (start, 0), "DOP853", **options)
+    assert_close(
+        np.ravel(last(sol.ys)), exact.y[:, -1], 1e-8 if epsilon > 0.1 else 1e-9
+    )
+
+
+@pytest.mark.parametrize("time", [1e-10, 1e10])
+def test_the_time_scale_does_not_overflow_in_single_precision(time):
+    q, T = jnp.array([1.0, 0.0], jnp.float32), jnp.float32(time)
+    system = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), lambda t, q, args: -1 / jnp.linalg.norm(q) / T / T
+    )
+    found = control(1.0, system).density(jnp.float32(0), (q, q), None)
+    assert_close(found / T, 5**-0.25, 1e-6)
 
 
 @pytest.mark.parametrize("bodies, space", [(3, 2), (7, 2), (50, 3)])

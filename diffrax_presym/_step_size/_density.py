@@ -4,6 +4,7 @@ from collections.abc import Callable
 import diffrax as dfx
 import equinox as eqx
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -47,7 +48,9 @@ class StepDensityController(dfx.AbstractStepSizeController):
     most four directional derivatives of the force per step: for more than four
     positions the sum is estimated from four fixed random directions, with which the
     time scale is mostly within a quarter of itself. `epsilon` of 0.1 is about 63 steps
-    for each period.
+    for each period. Of a single position the slope may vanish, at an inflection of the
+    potential: the next two derivatives along the motion are added to it there,
+    `σ = (s^6 + (ds/dt)^4 + |d²s/dt²|^3)^(-1/12)` with `s` the slope.
 
     Requires `dt0=None`. A solve fails with `RESULTS.step_density_missed` if a step
     differs from `ε σ` at one of its ends by more than a factor of four, as `epsilon` is
@@ -190,15 +193,36 @@ class TimeScale(eqx.Module):
         q, p = y
         flat, structure = ravel_pytree(q)
 
-        def acceleration(x):
-            q = structure(x)
-            velocity = lambda p: self.system.velocity(t, q, p, args)
-            force = self.system.force(t, q, p, args)
-            return ravel_pytree(jax.jvp(velocity, (p,), (force,))[1])[0]
+        def motion(t, q, p):
+            velocity = self.system.velocity(t, q, p, args)
+            return velocity, self.system.force(t, q, p, args)
 
-        along = lambda x: jax.jvp(acceleration, (flat,), (x,))[1]
-        slopes = jax.vmap(along)(cast_to(_directions(flat.size), flat))
-        return jnp.sum(slopes**2) ** -0.25
+        def slopes(t, q, p):
+            def acceleration(x):
+                velocity = lambda q, p: self.system.velocity(t, q, p, args)
+                at = structure(x), p
+                return ravel_pytree(jax.jvp(velocity, at, motion(t, *at))[1])[0]
+
+            flat, _ = ravel_pytree(q)
+            along = lambda x: jax.jvp(acceleration, (flat,), (x,))[1]
+            return jax.vmap(along)(cast_to(_directions(flat.size), flat))
+
+        def rate(fn):
+            start = lambda t, q, p: (jnp.ones_like(t), *motion(t, q, p))
+            return lambda *at: jax.jvp(fn, at, start(*at))[1]
+
+        # Of one position also the next two derivatives in time: the slope may vanish.
+        found = [slopes]
+        if flat.size == 1:
+            found += [rate(slopes), rate(rate(slopes))]
+        powers = {k: fn(as_time(t), q, p) for k, fn in enumerate(found, start=2)}
+        # In units of the largest rate, so that nothing overflows.
+        rates = [jnp.max(jnp.abs(x)) ** (1 / k) for k, x in powers.items()]
+        unit = lax.stop_gradient(functools.reduce(jnp.maximum, rates))
+        unit = jnp.where(unit > 0, unit, 1)
+        squares = {k: jnp.sum((x / unit**k) ** 2) for k, x in powers.items()}
+        total = sum(square ** (6 / k) for k, square in squares.items())
+        return total ** (-1 / 12) / unit
 
 
 @functools.cache
