@@ -24,6 +24,19 @@ DRAGGED = dps.MechanicalSystem(
 )
 
 
+def test_the_clock_is_not_rounded_where_its_precision_is_low():
+    # A circle in single precision, from a time of which a step has few digits.
+    t0, t1 = jnp.float32(1e4), jnp.float32(1e4 + 100)
+    y0 = jnp.array([1.0, 0.0], jnp.float32), jnp.array([0.0, 1.0], jnp.float32)
+    saveat = dfx.SaveAt(ts=jnp.array([1e4 + 37, 1e4 + 100], jnp.float32))
+    step, solver = control(0.3, DISTANCE), dps.Compensated(dps.TunedRKN6())
+    sol = solve(step, solver, t0, t1, y0, adjoint=OWN, saveat=saveat, max_steps=None)
+    assert succeeds(sol)
+    angle = np.asarray(sol.ts, float) - 1e4
+    exact = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    assert_close(np.asarray(sol.ys[0]), exact, 1e-4)
+
+
 def saved(adjoint, solver=None, density=DISTANCE, sign=1, e=0.6, **kwargs):
     """An orbit with friction from its apocentre, at 30 times, as a function of what it
     depends on."""

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._numbers import Scalar, State
 from .._scheme._base import between, Point, Scheme
-from .._scheme._engine import Result
+from .._scheme._engine import Result, Span
 from .._system._bound import System
 
 
@@ -59,6 +59,10 @@ class AbstractSteps(eqx.Module):
     @abc.abstractmethod
     def end(self, n: Array, point: Point) -> Float[Array, ""]:
         """The end of a step."""
+
+    @abc.abstractmethod
+    def since_begin(self, n: Array, point: Point, t: Array) -> Float[Array, ""]:
+        """The time from the start of a step, which may be known better than that."""
 
     @abc.abstractmethod
     def previous(self, n: Array, point: Point) -> Float[Array, ""]:
@@ -122,9 +126,10 @@ class AbstractSteps(eqx.Module):
         self, scheme: Scheme, system: System, n: Array, point: Point, t: Array
     ) -> State:
         """The state at a time within a step."""
-        t0, (y, carry) = self.begin(n, point), point
-        start = y, self.split(carry)[0]
-        return between(scheme, system, system.time(t0), start, system.time(t))
+        y, carry = point
+        times = self.begin(n, point), t, self.since_begin(n, point, t)
+        span = Span(*map(system.time, times))
+        return between(scheme, system, span, (y, self.split(carry)[0]))
 
     @abc.abstractmethod
     def explain(

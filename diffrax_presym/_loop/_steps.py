@@ -34,9 +34,9 @@ class StepsBetween(dfx.AbstractStepSizeController):
     `jax.numpy.interp`: a step across a kink has order two at most, steps that end there
     keep the order of the scheme. Where the force jumps at these times, schemes that
     take it at the ends of steps have order one: `TunedRKN6`, `BlanesMoanRKN4`,
-    `Strang`, the momentum-first leapfrog and what is composed of them; other schemes
-    keep their order. The steps between two of the times are equal, and as few as are
-    not longer than `dt0`.
+    `Strang`, `PresymplecticTao`, the momentum-first leapfrog and what is composed of
+    them; other schemes keep their order. The steps between two of the times are equal,
+    and as few as are not longer than `dt0`.
 
     !!! example
 
@@ -71,7 +71,8 @@ class StepsBetween(dfx.AbstractStepSizeController):
                 f"{given.shape}."
             )
         if isinstance(times, Tracer):
-            self.times = jnp.sort(given)
+            # Those that are not a number are known now only to be ignored.
+            self.times = jnp.sort(jnp.where(jnp.isnan(given), jnp.inf, given))
         else:  # Once, rather than in each solve.
             self.times = jnp.asarray(np.sort(np.atleast_1d(times)), given.dtype)
 
@@ -235,6 +236,9 @@ class Steps(AbstractSteps):
     def end(self, n, point):
         return self.time(n + 1)
 
+    def since_begin(self, n, point, t):
+        return t - self.time(n)
+
     def previous(self, n, point):
         return self.time(n - 1)
 
@@ -323,7 +327,7 @@ class Steps(AbstractSteps):
             n = jnp.where(ts - before < next - ts, after - 1, after).astype(int)
         start = self.time(n)
         largest = jnp.maximum(jnp.abs(self.t0), jnp.abs(start))
-        rounding = 4 * jnp.finfo(start.dtype).eps * largest
+        rounding = 4 * float(jnp.finfo(start.dtype).eps) * largest
         inside = jnp.abs(ts - start) > jnp.minimum(rounding, length / 64)
         inside &= self.total > 0
         return jnp.where(inside & (ts < start), n - 1, n), inside

@@ -26,8 +26,13 @@ from ._tracks import AbstractTrack, put, stack
 class Clock(NamedTuple):
     """The time that a solve has come to, and the state of its controller."""
 
-    t: Float[Array, ""]
+    # Steps are not rounded to the precision of the time.
+    t: tree.Sum
     control: Float[Array, ""]
+
+
+def _exact(t: Array) -> tree.Sum:
+    return tree.Sum(t, jnp.zeros_like(t))
 
 
 class VariableSteps(AbstractSteps):
@@ -53,14 +58,18 @@ class VariableSteps(AbstractSteps):
         return point[1][1]
 
     def begin(self, n, point):
-        return self._clock(point).t
+        return self._clock(point).t.value
 
     def end(self, n, point):
         # The last one is cut off at the end of the solve.
         t, control = self._clock(point)
-        end = t + self.controller.step_size(control)
-        rounding = 4 * jnp.finfo(t.dtype).eps * jnp.maximum(abs(self.t0), abs(self.t1))
+        end = (t + self.controller.step_size(control)).value
+        largest = jnp.maximum(abs(self.t0), abs(self.t1))
+        rounding = 4 * float(jnp.finfo(end.dtype).eps) * largest
         return jnp.where(end > self.t1 - rounding, self.t1, end)
+
+    def since_begin(self, n, point, t):
+        return _exact(t) - self._clock(point).t
 
     def previous(self, n, point):
         return self.begin(n, point)
@@ -95,7 +104,7 @@ class VariableSteps(AbstractSteps):
         return self._within(stop.time, n, point)
 
     def join(self, carry, control):
-        return carry, Clock(self.t0, control)
+        return carry, Clock(_exact(self.t0), control)
 
     def split(self, carry):
         carry, (_, control) = carry
@@ -106,24 +115,29 @@ class VariableSteps(AbstractSteps):
 
     def step(self, scheme, system, n, point, data):
         (y, (carry, (t, control))), end = point, self.end(n, point)
-        h = jnp.where(end < self.t1, self.controller.step_size(control), end - t)
-        span, start = Span(*map(system.time, (t, end, h))), (y, carry)
+        begin = t.value
+        h, rest = self.controller.step_size(control), _exact(self.t1)
+        is_last = end >= self.t1
+        h = jnp.where(is_last, rest - t, h)
+        t = tree.where(is_last, rest, t + h)
+        span, start = Span(*map(system.time, (begin, end, h))), (y, carry)
         (y1, carry), result = advance(scheme, system, span, start)
         result = check_step(scheme, system, span, start, (y1, carry), result)
         *_, control, failed = self.controller.adapt_step_size(
-            t, end, y, y1, system.args, None, 1, control
+            begin, end, y, y1, system.args, None, 1, control
         )
-        return (y1, (carry, Clock(end, control))), first_failure(result, failed)
+        return (y1, (carry, Clock(t, control))), first_failure(result, failed)
 
     def undo(self, scheme, system, n, point, data):
         # But for one that was cut off.
         y, (carry, (t, control)) = point
-        control = self.controller.reverse(t, y, system.args, control)
+        control = self.controller.reverse(t.value, y, system.args, control)
         h = self.controller.step_size(control)
-        span = Span(*map(system.time, (t - h, t, h)))
+        begin = t + -h
+        span = Span(*map(system.time, (begin.value, t.value, h)))
         data = prepare(scheme.moves, system, span, backward=True)
         y, carry = backward(scheme.moves, system, span, data, (y, carry))
-        return y, (carry, Clock(t - h, control))
+        return y, (carry, Clock(begin, control))
 
     def explain(self, scheme, system, n, ends, result):
         return result
@@ -159,7 +173,7 @@ class Timed(AbstractTrack):
 
     def visit(self, state, n, point, here):
         j, found, rows = state
-        inside = self.times[j] > point[1][1].t
+        inside = self.times[j] > point[1][1].t.value
         value = (n, inside), self.value(j, n, inside, point)
         return j + jnp.asarray(here, j.dtype), *put((found, rows), j, value, here)
 

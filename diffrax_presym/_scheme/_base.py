@@ -161,9 +161,8 @@ def check_step(
     return explain(scheme, system, lambda _: span, 1, ends, result)
 
 
-def between(scheme: Scheme, system: System, t0: Array, start: Point, t: Array) -> State:
-    """The state at `t` within a step from `t0`, in full order: a shorter step."""
-    span = Span(t0, t, t - t0)
+def between(scheme: Scheme, system: System, span: Span, start: Point) -> State:
+    """The state at the end of a part of a step, in full order: a shorter step."""
     return advance(scheme, system, span, start)[0][0]
 
 
@@ -188,7 +187,7 @@ def dense_info(
 
     def at(fraction):
         t = t0 + fraction * h
-        y = between(scheme, system, t0, start, t)
+        y = between(scheme, system, Span(t0, t, t - t0), start)
         return y, tree.scale(h, system.slope(t, y))
 
     return info | dict(inner=lax.map(at, cast_to(inner_points(number), h)))

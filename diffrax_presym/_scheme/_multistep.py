@@ -188,7 +188,7 @@ def _steps(span: Span, carry: _Carry) -> tuple[Array, Array]:
     length of the first of them."""
     h = jnp.abs(span.h)
     largest = jnp.abs(span.t0) + h * carry.steps
-    rounding = 8 * jnp.finfo(h.dtype).eps * largest
+    rounding = 8 * float(jnp.finfo(h.dtype).eps) * largest
     same = jnp.abs(span.h - carry.h) <= jnp.minimum(rounding, 1e-3 * h)
     first = same & (carry.steps > 0)
     return jnp.where(same, carry.steps, 0), jnp.where(first, carry.h, span.h)
