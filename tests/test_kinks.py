@@ -143,10 +143,11 @@ ORDERS = [
     (dps.PresymplecticGauss(3), 5, np.inf),
     (dps.PresymplecticLeapfrog("position"), 1.8, np.inf),
     *((x, 0.7, 1.3) for x in (RKN6, RKN4, dps.Strang(), dps.PresymplecticLeapfrog())),
+    (dps.PresymplecticTao(3.0), 0.7, 1.3),
 ]
 
 
-@pytest.mark.variants(9)
+@pytest.mark.variants(10)
 @pytest.mark.parametrize("solver, least, most", ORDERS)
 def test_steps_that_end_where_a_force_jumps(solver, least, most):
     jump, t1 = 0.9, 2.0

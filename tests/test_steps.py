@@ -176,3 +176,16 @@ def test_an_infinite_span():
     sol = too_long(jnp.inf, 0.1, max_steps=30)
     assert sol.result == dfx.RESULTS.max_steps_reached
     assert sol.stats["num_steps"] == 30
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_times_of_steps_between_that_are_not_known_to_be_numbers(sign):
+    @jax.jit
+    def end(times):
+        controller = dps.StepsBetween(sign * times)
+        more: Any = dict(adjoint=OWN, stepsize_controller=controller, max_steps=None)
+        span, y0 = (0.0, sign * 1.0, sign * 0.1), (jnp.ones(1), jnp.zeros(1))
+        return dfx.diffeqsolve(PENDULUM, dps.TunedRKN6(), *span, y0, **more).ys
+
+    gaps = end(jnp.array([jnp.nan, 0.37, jnp.nan]))
+    np.testing.assert_array_equal(gaps, end(jnp.array([-1.0, 0.37, 2.0])))

@@ -76,7 +76,8 @@ class Solution(NamedTuple):
         if finite and not all(np.all(np.isfinite(t)) for t in times):
             raise ValueError(
                 "The solve must save at times that do not depend on the step. Write "
-                "`SaveAt(t1=True)` or `SaveAt(ts=ts)`; with an event, the first."
+                "`SaveAt(t1=True)` or `SaveAt(ts=ts)`, with an event the first; and "
+                "leave out times that are NaN, gaps in measured ones."
             )
         finite = finite and all(np.all(np.isfinite(y)) for y in values)
         order = sol.stats.get("order")
