@@ -221,6 +221,7 @@ def _rows(x: Array, which: list[int]) -> Array:
     which XLA does not compile a loop to one function."""
     parts, i = [], 0
     while i < len(which):
+        # As many as go up, or down, by one.
         first, down = which[i], which[i + 1 : i + 2] == [which[i] - 1]
         ahead = enumerate(first - k if down else k - first for k in which[i:])
         number = next((n for n, k in ahead if k != n), len(which) - i)
