@@ -251,7 +251,7 @@ def _final_state(problem: Problem, way: Reversal | Checkpoints, init_state, stru
 @eqx.filter_custom_vjp
 def _solve(inputs, way: Reversal | Checkpoints):
     problem, buffers = inputs
-    # With a gradient nothing was gained by that.
+    # The two passes of a gradient were measured to gain nothing by it.
     return as_one_function(lambda: _outputs(problem, buffers, run(problem)))
 
 

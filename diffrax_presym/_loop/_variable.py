@@ -115,11 +115,10 @@ class VariableSteps(AbstractSteps):
 
     def step(self, scheme, system, n, point, data):
         (y, (carry, (t, control))), end = point, self.end(n, point)
-        begin = t.value
-        h, rest = self.controller.step_size(control), _exact(self.t1)
-        is_last = end >= self.t1
-        h = jnp.where(is_last, rest - t, h)
-        t = tree.where(is_last, rest, t + h)
+        h, begin, is_last = self.controller.step_size(control), t.value, end >= self.t1
+        t1 = _exact(self.t1)
+        h = jnp.where(is_last, t1 - t, h)
+        t = tree.where(is_last, t1, t + h)
         span, start = Span(*map(system.time, (begin, end, h))), (y, carry)
         (y1, carry), result = advance(scheme, system, span, start)
         result = check_step(scheme, system, span, start, (y1, carry), result)

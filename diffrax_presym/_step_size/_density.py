@@ -8,7 +8,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import ArrayLike
+from jaxtyping import Array, ArrayLike
 
 from .._checks import as_positive, describe
 from .._numbers import as_time, cast_to, Scalar, State
@@ -190,32 +190,12 @@ class TimeScale(eqx.Module):
     system: AbstractSystem
 
     def __call__(self, t, y: State, args) -> Scalar:
-        q, p = y
-        flat, structure = ravel_pytree(q)
-
-        def motion(t, q, p):
-            velocity = self.system.velocity(t, q, p, args)
-            return velocity, self.system.force(t, q, p, args)
-
-        def slopes(t, q, p):
-            def acceleration(x):
-                velocity = lambda q, p: self.system.velocity(t, q, p, args)
-                at = structure(x), p
-                return ravel_pytree(jax.jvp(velocity, at, motion(t, *at))[1])[0]
-
-            flat, _ = ravel_pytree(q)
-            along = lambda x: jax.jvp(acceleration, (flat,), (x,))[1]
-            return jax.vmap(along)(cast_to(_directions(flat.size), flat))
-
-        def rate(fn):
-            start = lambda t, q, p: (jnp.ones_like(t), *motion(t, q, p))
-            return lambda *at: jax.jvp(fn, at, start(*at))[1]
-
-        # Of one position also the next two derivatives in time: the slope may vanish.
-        found = [slopes]
-        if flat.size == 1:
-            found += [rate(slopes), rate(rate(slopes))]
-        powers = {k: fn(as_time(t), q, p) for k, fn in enumerate(found, start=2)}
+        found: list[Callable] = [functools.partial(self._slopes, args)]
+        if ravel_pytree(y[0])[0].size == 1:
+            # Also the next two derivatives in time: the slope may vanish.
+            for _ in range(2):
+                found.append(self._rate(args, found[-1]))
+        powers = {k: fn(as_time(t), *y) for k, fn in enumerate(found, start=2)}
         # In units of the largest rate, so that nothing overflows.
         rates = [jnp.max(jnp.abs(x)) ** (1 / k) for k, x in powers.items()]
         unit = lax.stop_gradient(functools.reduce(jnp.maximum, rates))
@@ -223,6 +203,31 @@ class TimeScale(eqx.Module):
         squares = {k: jnp.sum((x / unit**k) ** 2) for k, x in powers.items()}
         total = sum(square ** (6 / k) for k, square in squares.items())
         return total ** (-1 / 12) / unit
+
+    def _motion(self, args, t, q, p) -> State:
+        velocity = self.system.velocity(t, q, p, args)
+        return velocity, self.system.force(t, q, p, args)
+
+    def _rate(self, args, fn: Callable) -> Callable:
+        """The derivative of `fn(t, q, p)` along the motion."""
+
+        def rate(t, q, p):
+            along = jnp.ones_like(t), *self._motion(args, t, q, p)
+            return jax.jvp(fn, (t, q, p), along)[1]
+
+        return rate
+
+    def _slopes(self, args, t, q, p) -> Array:
+        """Derivatives of the accelerations by the positions, in some directions."""
+        flat, structure = ravel_pytree(q)
+
+        def acceleration(x):
+            velocity = lambda q, p: self.system.velocity(t, q, p, args)
+            at = structure(x), p
+            return ravel_pytree(jax.jvp(velocity, at, self._motion(args, t, *at))[1])[0]
+
+        along = lambda x: jax.jvp(acceleration, (flat,), (x,))[1]
+        return jax.vmap(along)(cast_to(_directions(flat.size), flat))
 
 
 @functools.cache
