@@ -4,10 +4,13 @@ All are symmetric, so only the first half is listed, including the middle. All k
 digits are kept, more than a float holds.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+import jax
+import jax.lax as lax
+import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array, ArrayLike, PyTree
 
 from ._numbers import cast_to
 
@@ -85,3 +88,15 @@ def lengths(order: int, h: ArrayLike) -> Array:
     known = {2: (1.0,), 4: SUZUKI_4} | SOFRONIOU_SPALETTA
     weights = next((x for r, x in known.items() if r >= order), known[10])
     return cast_to(np.array(weights), h) * h
+
+
+def over_stages(stage: Callable, state: PyTree, rows: PyTree) -> PyTree:
+    """The state after `stage(state, row)` for each row of arrays."""
+    if len(jtu.tree_leaves(rows)[0]) == 1:
+        # The derivative of a loop of one iteration copies all that it keeps, one by
+        # one: that may be a fifth of the code of a gradient.
+        return stage(state, jtu.tree_map(lambda x: x[0], rows))
+    # A gradient computes each again: to keep all that they consist of may take twice as
+    # long to compile.
+    stage = jax.checkpoint(stage, prevent_cse=False)
+    return lax.scan(lambda *x: (stage(*x), None), state, rows)[0]

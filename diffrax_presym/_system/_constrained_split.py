@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
 from .. import _tree as tree
-from .._compositions import lengths
+from .._compositions import lengths, over_stages
 from .._numbers import State, Time
 from .._results import CONSTRAINT_NOT_SOLVED, NOT_REVERSIBLE, SUCCESSFUL
 from ._bound import System
@@ -78,11 +78,10 @@ class ConstrainedSplit(AbstractSplit):
                 other = dfx.RESULTS.where(found, SUCCESSFUL, NOT_REVERSIBLE)
                 failure = dfx.RESULTS.where(failure == SUCCESSFUL, other, failure)
             result = dfx.RESULTS.where(result == SUCCESSFUL, failure, result)
-            return (t + h, y, result), None
+            return t + h, y, result
 
         success = jtu.tree_map(jnp.asarray, SUCCESSFUL)
-        start, single = (t, y, success), len(data[0]) == 1
-        return lax.scan(stage, start, data, unroll=single)[0][1:]
+        return over_stages(stage, (t, y, success), data)[1:]
 
     def _stage(self, system, t, h, data, y) -> tuple[State, Array]:
         term, free, args, q = system.term, _free(system), system.args, y[0]
@@ -112,8 +111,8 @@ class ConstrainedSplit(AbstractSplit):
     def kick(self, system, t, h, y, force, order) -> State:
         if self.base.kick_by == "force":
             return self.base.kick(_free(system), t, h, y, force, order)
-        stage = lambda y, h: (self._kick_stage(system, t, h, y, force), None)
-        return lax.scan(stage, y, lengths(order, h))[0]
+        stage = lambda y, h: self._kick_stage(system, t, h, y, force)
+        return over_stages(stage, y, lengths(order, h))
 
     def _kick_stage(self, system, t, h, y, force) -> State:
         """A kick with friction: two halves, and the multipliers between them."""

@@ -5,11 +5,10 @@ import math
 from typing import TYPE_CHECKING
 
 import equinox as eqx
-import jax.lax as lax
 from jaxtyping import PyTree
 
 from .. import _tree as tree
-from .._compositions import lengths
+from .._compositions import lengths, over_stages
 from .._friction._base import LinearPart
 from .._friction._drag import Drag
 from .._friction._fit import fit_friction
@@ -90,12 +89,12 @@ def _kick_with_friction(system, t, h, y, force, order) -> State:
             dp = tree.add(dp, drag.decay(h, tree.add(p, dp), mechanics.mass))
         return dp
 
-    def stage(dp: PyTree, h: Time) -> tuple[PyTree, None]:
+    def stage(dp: PyTree, h: Time) -> PyTree:
         dp = pushed(slowed(drags, dp, h / 2), h)
-        return slowed(drags[::-1], dp, h / 2), None
+        return slowed(drags[::-1], dp, h / 2)
 
     if drags:
-        dp = lax.scan(stage, tree.zeros(p), lengths(order, h))[0]
+        dp = over_stages(stage, tree.zeros(p), lengths(order, h))
     else:
         dp = pushed(tree.zeros(p), h)
     return system.add(y, (None, dp))

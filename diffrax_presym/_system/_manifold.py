@@ -5,14 +5,13 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax
-import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import PyTree
 
 from .. import _tree as tree
 from .._checks import check_callable, describe, match
-from .._compositions import lengths
+from .._compositions import lengths, over_stages
 from .._forms import divide, multiply
 from .._friction._base import AbstractFriction, MASS, Mechanics
 from .._friction._damping import as_laws
@@ -249,9 +248,9 @@ class ManifoldSplit(AbstractForceSplit):
     def drift(self, system, t, h, data, y) -> State:
         def stage(y, row):
             q, p = self._stage(system, *row, *tree.values(y))
-            return system.add(y, tree.sub((q, p), tree.values(y))), None
+            return system.add(y, tree.sub((q, p), tree.values(y)))
 
-        return lax.scan(stage, y, data, unroll=len(data[0]) == 1)[0]
+        return over_stages(stage, y, data)
 
     def _stage(self, system, h, data, q, p) -> State:
         term, friction = system.term, system.friction
@@ -260,9 +259,6 @@ class ManifoldSplit(AbstractForceSplit):
             move = lambda q, p: term.pair(term.map(flow, q, p))
             if friction is None:
                 return move(q, p)
-            # A gradient computes it again: to keep all that it consists of, at each of
-            # the stages between which friction acts, takes twice as long to compile.
-            move = jax.checkpoint(move, prevent_cse=False)
             q, p = move(q, tree.add(p, friction.decay(data[0], p)))
             return q, tree.add(p, friction.decay(data[1], p))
         # Friction at a rate: a shorter time, and a slower motion.
