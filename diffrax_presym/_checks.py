@@ -16,7 +16,11 @@ from ._numbers import cast_to
 def as_parameter(x, name: str, instead: str = "") -> Inexact[Array, "..."]:
     """A user's number as a leaf for `jax.grad` and `eqx.filter_grad`."""
     if not eqx.is_array_like(x):
-        instead = " Write `jnp.array(...)`." if isinstance(x, list | tuple) else instead
+        if isinstance(x, list | tuple):
+            raise ValueError(
+                f"{name} must be an array, but got a {type(x).__name__}. Write "
+                "`jnp.array(...)`."
+            )
         raise ValueError(f"{name} must be a real number, but got {x!r}.{instead}")
     if jnp.issubdtype(jnp.result_type(x), jnp.complexfloating):
         raise ValueError(f"{name} must be real, but got {x!r}.")

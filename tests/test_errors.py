@@ -170,6 +170,8 @@ SOLVERS = {
     "base of Yoshida": (call(dps.PresymplecticYoshida4, EULER), "symmetric"),
     "order of a composition": (call(dps.Composition, LEAPFROG, [1.0], order=0), "got 0",
         "must be a positive integer", "omitted"),
+    "base with error estimates": (call(dps.Compensated, dfx.HalfSolver(LEAPFROG)),
+        "got a `HalfSolver`", BASE, "`HalfSolver(Compensated(Strang()))`"),
     "weights that almost sum to one": (
         call(dps.Composition, LEAPFROG, [0.5, 0.5 + 1e-9]), "sum to 1.000000001", SUM,
         "divide by their sum"),

@@ -324,6 +324,10 @@ vector = lambda t, y, args: y[0]
     [
         (lambda: control(-0.1, DISTANCE), "epsilon"),
         (lambda: control(0.1, WRONG), "density"),
+        (
+            lambda: solve(control(jnp.ones(2), DISTANCE), LEAPFROG, 0.0, 1.0, Y0),
+            r"must be a number, but got the shape \(2,\)",
+        ),
         (lambda: solve(CONTROL, LEAPFROG, 0.0, 1.0, Y0, dt0=0.1), "dt0=None"),
         (lambda: solve(control(0.1, vector), LEAPFROG, 0.0, 1.0, Y0), "real scalar"),
         (lambda: by_own_loop(LEAPFROG, saveat=BOTH), "times and steps in one.*subs="),

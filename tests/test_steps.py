@@ -97,6 +97,11 @@ def test_a_step_that_is_no_step(dt0):
         assert "dt0" in str(error)
 
 
+def test_times_in_a_list_are_an_error():
+    with pytest.raises(ValueError, match=r"an array, but got a list.*`jnp.array"):
+        dps.StepsBetween([0.1, 0.2])
+
+
 @pytest.mark.parametrize("ts", [[0.0, 0.25, 0.5], [0.5, 0.75, 1.0], [-0.5, 0.5, 1.0]])
 def test_prescribed_steps_are_from_the_start_to_the_end(ts):
     with pytest.raises(Exception, match="must be `t0` and `t1`"):

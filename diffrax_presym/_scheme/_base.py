@@ -204,6 +204,12 @@ def refuse_constrained(solver: AbstractPresymplecticSolver, system: System) -> N
 
 
 def check_base(base) -> None:
+    # An instance of `HalfSolver` is one of the class of the solver in it.
+    if isinstance(base, dfx.HalfSolver):
+        raise ValueError(
+            "`base` must be a presymplectic solver, but got a `HalfSolver`. Wrap the "
+            "whole, `HalfSolver(Compensated(Strang()))`."
+        )
     if not isinstance(base, AbstractPresymplecticSolver):
         raise ValueError(
             "`base` must be a presymplectic solver, for example "

@@ -170,6 +170,11 @@ class StepDensityController(dfx.AbstractStepSizeController):
     def _length(self, t, y, args):
         """`ε σ`."""
         t = as_time(t)
+        if jnp.shape(self.epsilon) != ():
+            raise ValueError(
+                "`StepDensityController(epsilon=...)` must be a number, but got the "
+                f"shape {jnp.shape(self.epsilon)}. Solve for each by `jax.vmap`."
+            )
         sigma = self.density(self.direction * t, y, args)
         if jnp.shape(sigma) != () or not jnp.isrealobj(sigma):
             raise ValueError(
