@@ -137,6 +137,15 @@ def test_positions_near_the_origin(friction, solver, kind):
     assert jnp.all(good) and jnp.max(violation) < 20 * float(jnp.finfo(kind).eps)
 
 
+def test_the_slope_at_both_ends_of_a_correction_is_the_same():
+    # It is 1 at zero, and also where the first correction ends but for 8e-6.
+    bump = lambda x: 0.015 * (x / 2 - jnp.sin(2 * jnp.pi * x) / (4 * jnp.pi))
+    miss = lambda x: x - 1 + bump(x) - bump(1.0)
+    x, found = _multipliers.find_root(miss, jnp.zeros(1), None)
+    assert found
+    np.testing.assert_allclose(x, 1, 0, 1e-15)
+
+
 def test_strong_friction_over_a_step():
     """The motion is slow, and follows the force: `x' = -g sin(x) / rate`."""
     for rate in (1e4, 1e6, 1e8):

@@ -178,7 +178,9 @@ def find_root(
 
     It was if the derivative of the function did not change over the last correction but
     one: relative to that, the error that the last leaves is the third power of half of
-    the change. This has no scale, and holds where only rounding is left.
+    the change. This has no scale, and holds where only rounding is left. As the change
+    is small also of a function that is symmetric about the middle of that correction,
+    what it left must be as small as this says, or not smaller, which is rounding.
     """
 
     def newton(residual: LinearMap, x: Multipliers):
@@ -190,9 +192,10 @@ def find_root(
             x, _, count, change, miss = state
             new, linear = jax.linearize(residual, x)
             linear = _as_matrix(linear, x, solver) or linear
-            bend = tree.largest(linear(change) - miss)
-            limit = 2 * float(jnp.finfo(x.dtype).eps) ** (1 / 3)
-            found = bend <= limit * tree.largest(miss)
+            bend, before = tree.largest(linear(change) - miss), tree.largest(miss)
+            limit, left = float(jnp.finfo(x.dtype).eps) ** (1 / 3), tree.largest(new)
+            found = (left <= limit * before) | (left >= before / 8)
+            found &= bend <= 2 * limit * before
             change = solve(linear, new, solver)
             return x - change, found, count + 1, change, new
 
