@@ -117,16 +117,15 @@ class ConstrainedSplit(AbstractSplit):
     def _kick_stage(self, system, t, h, y, force) -> State:
         """A kick with friction: two halves, and the multipliers between them."""
         term, free, args = system.term, _free(system), system.args
-        half = lambda y: self.base.kick(free, t, h / 2, y, force, _ORDER)
-        middle, q = half(y), tree.values(y[0])
-        normal = term.normal(t, q, args)
+        q, p = tree.values(y)
+        half = self.base.change(free, t, h / 2, q, p, force, _ORDER, once=False)
+        first, normal = half(p), term.normal(t, q, args)
 
-        def pushed(x: Multipliers) -> State:
-            return half(system.add(middle, (None, tree.scale(-1, normal(x)))))
+        def change(x: Multipliers) -> PyTree:
+            dp = tree.sub(first, normal(x))
+            return tree.add(dp, half(tree.add(p, dp)))
 
-        def rate(x: Multipliers) -> Multipliers:
-            return term.rate(t, q, tree.values(pushed(x))[1], args)
-
+        rate = lambda x: term.rate(t, q, tree.add(p, change(x)), args)
         like = jnp.zeros_like(term.value(t, q, args))
         x, found = find_root(rate, like, term.linear_solver)
-        return tree.invalid_if(~found, pushed(x))
+        return system.add(y, (None, tree.invalid_if(~found, change(x))))

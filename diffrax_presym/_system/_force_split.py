@@ -2,9 +2,11 @@
 
 import abc
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import equinox as eqx
+import jax
 from jaxtyping import PyTree
 
 from .. import _tree as tree
@@ -57,17 +59,38 @@ class AbstractForceSplit(AbstractSplit):
     def kick(self, system, t, h, y, force, order) -> State:
         if self.kick_by == "force":
             return super().kick(system, t, h, y, force, order)
+        q, p = tree.values(y)
+        change = self.change(system, t, h, q, p, force, order, once=True)
+        return system.add(y, (None, change(p)))
+
+    def change(
+        self,
+        system: "System",
+        t: Time,
+        h: Time,
+        q: PyTree,
+        p: PyTree,
+        force: PyTree,
+        order: int,
+        once: bool,
+    ) -> Callable[[PyTree], PyTree]:
+        """The change of momenta such as `p` by a kick at a place, as their function. If
+        that is not applied `once`, what takes longer to prepare pays."""
         if self.kick_by == "friction":
-            return _kick_with_friction(system, t, h, y, force, order)
-        term, (q, p), args = system.term, tree.values(y), system.args
+            return _by_friction(system, t, h, p, force, order, once)
+        term, args = system.term, system.args
         state = lambda p: (t, q, p, term.velocity(t, q, p, args), args)
         total = lambda p: term.add_forces(force, term.external, *state(p))
-        dp, found = force_flow(total, h, p, order)
-        return system.add(y, (None, tree.invalid_if(~found, dp)))
+
+        def change(p: PyTree) -> PyTree:
+            dp, found = force_flow(total, h, p, order)
+            return tree.invalid_if(~found, dp)
+
+        return change
 
 
-def _kick_with_friction(system, t, h, y, force, order) -> State:
-    (force, forms, drags), p = force, tree.values(y)[1]
+def _by_friction(system, t, h, p, force, order, once) -> Callable[[PyTree], PyTree]:
+    force, forms, drags = force
     parts, mechanics = system.parts, system.term.mechanics
     pairs = zip(parts.local, forms, strict=True)
     linear = [
@@ -76,25 +99,37 @@ def _kick_with_friction(system, t, h, y, force, order) -> State:
     ]
     friction = fit_friction(linear, mechanics, p)
 
-    def pushed(dp: PyTree, h: Time) -> PyTree:
+    def prepare(h: Time) -> PyTree:
         if friction is None:
-            return tree.add_scaled(dp, h, force)
+            return None
         bad = (as_time(h) < 0) & (friction.over(t, h) > _MOST_BACK)
-        data = tree.invalid_if(bad, friction.prepare(t, h, order))
-        gained = friction.decay(data, tree.add(p, dp))
-        return tree.add(dp, tree.add(gained, friction.respond(data, force)))
+        data = friction.prepare(t, h, order)
+        return tree.invalid_if(bad, data if once else friction.fix([data])[0])
 
-    def slowed(drags: list[Drag], dp: PyTree, h: Time) -> PyTree:
-        for drag in drags:
-            dp = tree.add(dp, drag.decay(h, tree.add(p, dp), mechanics.mass))
-        return dp
+    def pushed(p: PyTree, h: Time, data: PyTree) -> PyTree:
+        if friction is None:
+            return tree.scale(h, force)
+        # One exponential, and not two: of the momentum, and of the force.
+        return friction.respond(data, friction.net_force(t, force, p))
 
-    def stage(dp: PyTree, h: Time) -> PyTree:
-        dp = pushed(slowed(drags, dp, h / 2), h)
-        return slowed(drags[::-1], dp, h / 2)
+    if not drags:
+        data = prepare(h)
+        return lambda p: pushed(p, h, data)
+    h = lengths(order, h)
+    rows = h, jax.vmap(prepare)(h)
 
-    if drags:
-        dp = over_stages(stage, tree.zeros(p), lengths(order, h))
-    else:
-        dp = pushed(tree.zeros(p), h)
-    return system.add(y, (None, dp))
+    def change(p: PyTree) -> PyTree:
+        def slowed(drags: list[Drag], dp: PyTree, h: Time) -> PyTree:
+            for drag in drags:
+                dp = tree.add(dp, drag.decay(h, tree.add(p, dp), mechanics.mass))
+            return dp
+
+        def stage(dp: PyTree, row) -> PyTree:
+            h, data = row
+            dp = slowed(drags, dp, h / 2)
+            dp = tree.add(dp, pushed(tree.add(p, dp), h, data))
+            return slowed(drags[::-1], dp, h / 2)
+
+        return over_stages(stage, tree.zeros(p), rows)
+
+    return change
