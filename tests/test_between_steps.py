@@ -249,20 +249,20 @@ def _selected(jaxpr):
 QUARTIC = dps.MechanicalSystem(
     dps.QuadraticKinetic(), lambda t, q, args: jnp.sum(q**4) / 4
 )
-VARIABLE = dps.StepDensityController(0.1, QUARTIC)
 
 
-@pytest.mark.parametrize(
-    "controller, dt0", [(dfx.ConstantStepSize(), 0.1), (VARIABLE, None)]
-)
-def test_a_batch_copies_nothing_that_was_saved(controller, dt0):
+@pytest.mark.parametrize("own", ["start", "times", "step"])
+@pytest.mark.parametrize("varies", [False, True])
+def test_a_batch_copies_nothing_that_was_saved(varies, own):
     members, number = 5, 37
 
-    def saved(p):
+    def saved(p, size, ts):
+        control = dps.StepDensityController(size, QUARTIC)
         ys = dfx.diffeqsolve(
-            *(QUARTIC, dps.BlanesMoanRKN4(), 0.0, 3.0, dt0, (jnp.ones(2), p)),
-            saveat=dfx.SaveAt(ts=jnp.linspace(0.1, 2.9, number)),
-            stepsize_controller=controller,
+            *(QUARTIC, dps.BlanesMoanRKN4(), 0.0, 3.0, None if varies else size),
+            (jnp.ones(2), p),
+            saveat=dfx.SaveAt(ts=ts),
+            stepsize_controller=control if varies else dfx.ConstantStepSize(),
             adjoint=dps.FixedStepAdjoint(),
             max_steps=None,
             throw=False,
@@ -271,10 +271,56 @@ def test_a_batch_copies_nothing_that_was_saved(controller, dt0):
         return ys[0]
 
     start = jnp.arange(2.0 * members).reshape(members, 2) / 4
-    program = jax.make_jaxpr(jax.vmap(saved))(start)
+    size, ts = jnp.array(0.1), jnp.linspace(0.1, 2.9, number)
+    if own == "times":
+        ts = jnp.sort(jax.random.uniform(jax.random.key(0), (members, number)) * 3)
+    if own == "step":
+        size = jnp.linspace(0.06, 0.1, members)
+    each = start, size, ts
+    axes = tuple(0 if x.shape[:1] == (members,) else None for x in each)
+    program = jax.make_jaxpr(jax.vmap(saved, axes))(*each)
     shapes = list(_selected(program.jaxpr))
     assert len(shapes) > 10
     # After the loop rows that were not reached are filled, once.
     assert shapes.count((members, number, 2)) <= 4
-    one_by_one = jnp.stack([saved(p) for p in start])
-    np.testing.assert_allclose(jax.vmap(saved)(start), one_by_one, rtol=1e-12)
+    member = lambda i: [
+        x if axis is None else x[i] for x, axis in zip(each, axes, strict=True)
+    ]
+    one_by_one = jnp.stack([saved(*member(i)) for i in range(members)])
+    np.testing.assert_allclose(jax.vmap(saved, axes)(*each), one_by_one, rtol=1e-12)
+
+
+@pytest.mark.variants(3)
+@pytest.mark.parametrize("solver", [RKN4, dps.Strang()])
+@pytest.mark.parametrize("kinks", [False, True])
+@pytest.mark.parametrize("axes", ["inner", "outer", "both"])
+def test_members_of_nested_batches_are_those_alone(solver, kinks, axes):
+    """The times, the start or both in the inner, the outer or both batches."""
+    more: Any = {}
+    if kinks:
+        times = jnp.array([0.21, 0.5]) * T1
+        more = {"stepsize_controller": dps.StepsBetween(times)}
+    shape = {"inner": (1, 3), "outer": (2, 1), "both": (2, 3)}[axes]
+    ts = jnp.sort(jax.random.uniform(jax.random.key(1), (*shape, 9)) * T1)
+    ts = jnp.broadcast_to(ts, (2, 3, 9))
+    gammas = jnp.array([[0.05], [0.3]]) * jnp.ones((2, 3))
+
+    def loss(gamma, ts):
+        ys: Any = solve(solver, 40, gamma=gamma, saveat=dfx.SaveAt(ts=ts), **more).ys
+        return jnp.sum(ys[0] ** 2 + jnp.cos(ts)[:, None] * ys[1]), ys
+
+    run = jax.value_and_grad(loss, has_aux=True)
+    if axes == "inner":
+        batched = jax.vmap(lambda g: jax.vmap(lambda t: run(g, t))(ts[0]))(gammas[:, 0])
+    elif axes == "outer":
+        inner = jax.vmap(run, (0, None))
+        batched = jax.vmap(inner)(gammas, ts[:, 0])
+    else:
+        batched = jax.vmap(jax.vmap(run))(gammas, ts)
+    (_, ys), slopes = batched
+    alone = jax.jit(run)
+    for i, j in np.ndindex(2, 3):
+        (_, wanted), slope = alone(gammas[i, j], ts[i, j])
+        got = np.stack([y[i, j] for y in ys])
+        np.testing.assert_allclose(got, np.stack(wanted), 1e-11, 1e-12)
+        np.testing.assert_allclose(slopes[i, j], slope, 1e-9)

@@ -178,10 +178,8 @@ def _run_steps(problem: Problem, tracks: PyTree) -> tuple[Progress, Array, PyTre
             here = steps.at(next_stop, n, point)
             # Members of a batch that take the same steps are here together. The others
             # are visited together, as JAX would otherwise copy all that was collected.
-            some, alike = here, True
-            if not steps.are_known:
-                alike = here & going
-                some = tree.any_member(alike)
+            alike = here if steps.are_known else here & going
+            some = tree.any_member(alike)
             visit = lambda track=track, state=state, alike=alike: track.visit(
                 state, n, point, alike
             )

@@ -1,14 +1,16 @@
 """What a solve collects on its way, and at which steps."""
 
 import abc
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Int, PyTree
+from jaxtyping import Array, Bool, Int, PyTree
 
 from .. import _tree as tree
 from .._numbers import cast_to, State
@@ -34,7 +36,7 @@ class AbstractTrack(eqx.Module):
     @abc.abstractmethod
     def visit(self, state: PyTree, n: Array, point: Point, here: Any) -> PyTree:
         """The state after that, at the start of step `n`, for those members of a batch
-        that are `here`, or `True`."""
+        that are `here`, as some are."""
 
     @abc.abstractmethod
     def rows(self, state: PyTree) -> PyTree:
@@ -60,7 +62,9 @@ class Track(AbstractTrack):
 
     def visit(self, state, n, point, here):
         j, rows = state
-        return j + jnp.asarray(here, j.dtype), put(rows, j, self.value(j, point), here)
+        return j + jnp.asarray(here, j.dtype), put_here(
+            rows, j, self.value(j, point), here
+        )
 
     def rows(self, state):
         return state[1]
@@ -87,25 +91,28 @@ class Interpolated(AbstractTrack):
         return Stop(jnp.maximum(n, self.stencils.first[j]))
 
     def visit(self, state, n, point, here):
-        assert here is True  # Steps are known.
-        _, j, ring, rows, finite = state
+        due, j, ring, rows, finite = state
         kink = jnp.zeros((), int)
         if self.kinks is not None:
             kink = jnp.any(self.kinks == n).astype(int)
         node = self.node(n, -kink, point)
-        ring = put(ring, n % NODES, node)
+        ring = put_here(ring, n % NODES, node, here)
+        complete = lambda j: here & (self.stencils.last[j] <= n)
 
         def save(x):
             j, rows = x
+            own = complete(j)
             y = self.stencils.combine(j, ring)
-            return j + 1, put(rows, j, self.value(j, y))
+            return j + own.astype(j.dtype), put_here(rows, j, self.value(j, y), own)
 
-        complete = lambda x: self.stencils.last[x[0]] <= n
-        j, rows = lax.while_loop(complete, save, (j, rows))
+        more = lambda x: tree.any_member(complete(x[0]))
+        j, rows = lax.while_loop(more, save, (j, rows))
         if self.kinks is not None:
-            after = lambda: put(ring, n % NODES, self.node(n, kink, point))
+            other = lambda: self.node(n, kink, point)
+            after = lambda: put_here(ring, n % NODES, other(), here)
             ring = lax.cond(kink == 1, after, lambda: ring)
-        return n + 1, j, ring, rows, finite & tree.all_finite(node)
+        finite &= ~here | tree.all_finite(node)
+        return jnp.where(here, n + 1, due), j, ring, rows, finite
 
     def rows(self, state):
         """Their number, they, and whether all nodes were finite."""
@@ -125,3 +132,34 @@ def put(rows: PyTree, i: Array, value: PyTree, here: Any = True) -> PyTree:
         return lax.dynamic_update_index_in_dim(xs, cast_to(x, xs), i, 0)
 
     return jtu.tree_map(leaf, rows, value)
+
+
+def put_here(rows: PyTree, i: Array, value: PyTree, here: Bool[Array, ""]) -> PyTree:
+    """Rows with one of them replaced, in those members of a batch that are `here`, as
+    some are: nothing is asked if all have the same row."""
+    one = _put_here(0)
+    return jtu.tree_map(lambda xs, x: one(xs, cast_to(x, xs), i, here), rows, value)
+
+
+@functools.cache
+def _put_here(axis: int) -> Callable[..., Array]:
+    @jax.custom_batching.custom_vmap
+    def put(xs: Array, x: Array, i: Array, here: Bool[Array, ""]) -> Array:
+        return lax.dynamic_update_index_in_dim(xs, x, i, axis)
+
+    @put.def_vmap
+    def _(size: int, batched: list[bool], xs, x, i, here):
+        each = lambda x, known: x if known else stack(x, size)
+        xs, x = map(each, (xs, x), batched[:2])
+        if not (batched[2] or batched[3]):
+            return _put_here(axis + 1)(xs, x, i, here), True
+
+        def masked(xs, x, i, here):
+            old = lax.dynamic_index_in_dim(xs, i, axis, keepdims=False)
+            x = jnp.where(here, x, old)
+            return lax.dynamic_update_index_in_dim(xs, x, i, axis)
+
+        i, here = map(each, (i, here), batched[2:])
+        return jax.vmap(masked)(xs, x, i, here), True
+
+    return put

@@ -20,7 +20,7 @@ from .._scheme._base import advance, check_step, Point
 from .._scheme._engine import backward, first_failure, prepare, Span
 from .._step_size._density import StepDensityController
 from ._base import AbstractSteps, MOST_STEPS, Stop
-from ._tracks import AbstractTrack, put, stack
+from ._tracks import AbstractTrack, put, put_here, stack
 
 
 class Clock(NamedTuple):
@@ -174,7 +174,7 @@ class Timed(AbstractTrack):
         j, found, rows = state
         inside = self.times[j] > point[1][1].t.value
         value = (n, inside), self.value(j, n, inside, point)
-        return j + jnp.asarray(here, j.dtype), *put((found, rows), j, value, here)
+        return j + jnp.asarray(here, j.dtype), *put_here((found, rows), j, value, here)
 
     def rows(self, state):
         return state[1:]
