@@ -4,7 +4,9 @@ Chains of damped pendulums to t = 50, by steps for errors of about 1e-3 and 1e-6
 time of a solve that is saved at 201 times over that of the end alone, and of the
 gradient of the sum of squares of what is saved over that of the end. `spread` is the
 largest error at all times over that at the ends of steps, of positions and of momenta,
-against steps eight times shorter by another scheme. `--quick` leaves out the largest.
+against steps eight times shorter by another scheme. Then a batch of pendulums whose
+saved times, steps or ends differ, over one in which they do not. `--quick` leaves out
+the largest.
 """
 
 from functools import partial
@@ -57,6 +59,40 @@ def spread(solver, n, y0):
         yield np.max(each[::4]), np.max(each) / np.max(each[::4])
 
 
+def batches(quick):
+    members, repeats = (64, 5) if quick else (1000, 21)
+    y0 = jnp.linspace(0.5, 1.5, members)[:, None], jnp.zeros((members, 1))
+    each, rng = jnp.linspace(0.8, 1.0, members), np.random.default_rng(0)
+    times = jnp.asarray(np.sort(T1 * rng.uniform(size=(members, SAVED))))
+    friction = dps.ConstantDamping(0.02)
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), potential, friction)
+
+    def one(y0, ts, step, end) -> Any:
+        return dfx.diffeqsolve(
+            *(system, dps.TunedRKN6(), 0.0, end * T1, step / 2, y0),
+            saveat=dfx.SaveAt(ts=ts * end),
+            adjoint=dps.FixedStepAdjoint(),
+            max_steps=None,
+        ).ys
+
+    known = {"times": TS, "steps": 1.0, "ends": 1.0}
+    own = {"times": times, "steps": each, "ends": each}
+    calls = {}
+    for name in ("none", *known):
+        args = [own[x] if x == name else known[x] for x in known]
+        axes = [0 if x == name else None for x in known]
+        value = jax.vmap(one, (0, *axes))
+        square = lambda y0, *args, value=value: jnp.sum(value(y0, *args)[0] ** 2)
+        calls[name] = partial(jax.jit(value), y0, *args)
+        calls["gradient", name] = partial(jax.jit(jax.grad(square)), y0, *args)
+    found = interleaved(calls, repeats)
+    caption = f"A batch of {members}, whose members differ in"
+    table = Table(caption, "what:<8", "saved:>6.1f", "gradient:>8.1f")
+    for name in known:
+        gradient = found["gradient", name].over(found["gradient", "none"])
+        table.row(name, found[name].over(found["none"]), gradient)
+
+
 def main():
     options = command_line(__doc__).parse_args()
     columns = "unknowns:>8", "steps:>6", "saved:>6.1f", "gradient:>8.1f", "error:>8.0e"
@@ -77,6 +113,7 @@ def main():
                 errors, ratios = zip(*spread(solver, n, y0), strict=True)
                 worst = " ".join(f"{x:.1f}" for x in ratios)
                 table.row(name, size, n, saved, gradient, max(errors), worst)
+    batches(options.quick)
 
 
 if __name__ == "__main__":

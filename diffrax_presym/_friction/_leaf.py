@@ -71,6 +71,9 @@ class EntryFriction(eqx.Module):
     def growth(self, t: Time, h: Time) -> Scalar:
         return jnp.max(increment(self.terms, t, h), initial=-jnp.inf)
 
+    def angle(self, h: Time) -> Scalar:
+        return jnp.zeros_like(as_time(h))
+
     def over(self, t: Time, h: Time) -> Scalar:
         each = jnp.abs(increment(self.terms, t, h))
         if not self.is_autonomous:
@@ -144,6 +147,11 @@ class MatrixFriction(eqx.Module):
         most = lambda x: jnp.max(jnp.sum(circles(x), axis=-1))
         forwards, backwards = most(symmetric), most(-symmetric)
         return jnp.where(h > 0, forwards, backwards) * jnp.abs(h)
+
+    def angle(self, h: Time) -> Scalar:
+        matrix = cast_to(self.matrix, h := as_time(h))
+        turning = jnp.abs(matrix - jnp.swapaxes(matrix, -1, -2)) / 2
+        return jnp.max(jnp.sum(turning, axis=-1), initial=0) * jnp.abs(h) / 2
 
     def over(self, t: Time, h: Time) -> Scalar:
         matrix = cast_to(self.matrix, h := as_time(h))

@@ -116,6 +116,10 @@ class LinearFriction(eqx.Module):
         `t`."""
         return functools.reduce(jnp.maximum, self._each("growth", t, h))
 
+    def angle(self, h: Time) -> Scalar:
+        """At least half of the angle by which momenta turn over a span."""
+        return functools.reduce(jnp.maximum, self._each("angle", h))
+
     def over(self, t: Time, h: Time) -> Scalar:
         """The largest friction over a span: the logarithm of the factor by which a
         momentum decays or grows. Friction that falls with time is strong for some steps

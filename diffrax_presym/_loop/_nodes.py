@@ -22,8 +22,8 @@ from ._steps import Steps
 
 
 NODES = 4  # of a polynomial
-# The largest friction over a step. With more the motion decays faster than the
-# polynomial can follow.
+# The largest friction over a step. With more the motion decays, or turns, faster than
+# the polynomial can follow.
 _MOST_FRICTION = 0.5
 # The largest ratio of neighbouring steps.
 _MOST_RATIO = 2.0
@@ -33,10 +33,10 @@ Node = tuple[State, State, State]
 
 
 def derivatives(
-    scheme: Scheme, system: System, t: Array, side: Array, point: Point
+    scheme: Scheme, system: System, t: Array, h: Array, side: Array, point: Point
 ) -> Node:
     """The state at a time of the solve, and its first two derivatives in that time:
-    where they jump, those before it (-1) or after it (1)."""
+    where they jump, those before it (-1) or after it (1); of a step of length `h`."""
     t = jnp.nextafter(t, t + cast_to(side, t))
     y, force = system.values(point[0]), scheme.end_force(point[1])
 
@@ -44,8 +44,13 @@ def derivatives(
         dy = system.slope(system.time(t), y, force)
         return tree.scale(jnp.asarray(system.direction), dy)
 
-    first = slope(t, y, force)
-    return y, first, jax.jvp(slope, (t, y), (jnp.ones_like(t), first))[1]
+    first, known = slope(t, y, force), y
+    along = jnp.ones_like(t), first
+    if getattr(system.term, "external", None) is not None:
+        # A speed has no derivative at rest, but one a moment later.
+        moment = float(jnp.finfo(h.dtype).eps) ** (2 / 3) * jnp.where(side < 0, -h, h)
+        t, y = t + cast_to(moment, t), tree.add_scaled(y, moment, first)
+    return known, first, jax.jvp(slope, (t, y), along)[1]
 
 
 class Ways(eqx.Module):
@@ -60,8 +65,8 @@ class Ways(eqx.Module):
         yes = jnp.minimum(steps.fewest, last) >= NODES - 1
         yes &= steps.ratio <= _MOST_RATIO
         if system.friction is not None:
-            growth = lax.stop_gradient(steps.largest_growth(system, last))
-            yes &= growth <= _MOST_FRICTION
+            most = lax.stop_gradient(steps.largest_friction(system, last))
+            yes &= most <= _MOST_FRICTION
         self.interpolated, self.some, self.others = (
             yes,
             tree.any_member(yes),

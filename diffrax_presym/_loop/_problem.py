@@ -87,7 +87,7 @@ class Problem(eqx.Module):
         if isinstance(steps, Steps) and some and resolved:
             at_node = convert(
                 lambda n, side, point: derivatives(
-                    scheme, system, steps.time(n), side, point
+                    *(scheme, system, steps.time(n), steps.lengths(n), side, point)
                 ),
                 *(n, n, start),
             )

@@ -201,19 +201,20 @@ class Steps(AbstractSteps):
             length = self.ts[n + 1] - self.ts[n]
         return jnp.where(length > 0, length, 1)
 
-    def largest_growth(self, system: System, last: Array) -> Float[Array, ""]:
-        """Of errors of `p` by friction, backwards over a step; its logarithm."""
+    def largest_friction(self, system: System, last: Array) -> Float[Array, ""]:
+        """Over a step: the logarithm of a decay, or the angle of a rotation."""
         friction = system.friction
         assert friction is not None
 
-        def growth(n: Array) -> Array:
+        def most(n: Array) -> Array:
             t0, t1, h = self.span(system, n)
-            return friction.growth(jnp.minimum(t0, t1), jnp.abs(h))
+            start, h = jnp.minimum(t0, t1), jnp.abs(h)
+            return jnp.maximum(friction.growth(start, h), friction.angle(h))
 
         if self.are_equal and friction.is_autonomous:
-            return growth(jnp.zeros((), int))
-        body = lambda n, x: jnp.maximum(x, growth(n))
-        return lax.fori_loop(0, last, body, growth(jnp.zeros((), int)))
+            return most(jnp.zeros((), int))
+        body = lambda n, x: jnp.maximum(x, most(n))
+        return lax.fori_loop(0, last, body, most(jnp.zeros((), int)))
 
     def span(self, system: System, n: Int[Array, ""]) -> Span:
         """Step `n`, in physical time."""

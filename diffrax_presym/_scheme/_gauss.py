@@ -163,9 +163,10 @@ class PresymplecticGauss(AbstractPresymplecticSolver):
 
     Friction of more than 1 over a step, the rate times its length (1/2 for one stage),
     is divided: the frame moves with that much of it, the rest is part of the force.
-    Order and symmetry are kept, and errors stay small for any strength, but the step is
-    no longer conformally symplectic to rounding, and from a strength of about 4 on it
-    needs a root finder.
+    Order and symmetry are kept, and errors of positions and of slow motion stay small
+    for any strength; a momentum that friction stops at once is lost within a few steps.
+    But the step is no longer conformally symplectic to rounding, and from a strength of
+    about 4 on it needs a root finder.
 
     Derivatives are those of the implicit function, not of the iterations, in forward
     and in reverse mode; `FixedStepAdjoint` takes gradients in constant memory.
