@@ -122,7 +122,7 @@ MUTANTS = [
         "first = jnp.maximum(first, low)", "first = jnp.maximum(first, 0)",
         tests="test_between_steps.py"),
     Mutant("values between steps are interpolated whatever the friction",
-        "_loop/_nodes.py", "yes &= growth <= _MOST_FRICTION", "yes &= growth < jnp.inf",
+        "_loop/_nodes.py", "yes &= most <= _MOST_FRICTION", "yes &= most < jnp.inf",
         tests="test_between_steps.py"),
     Mutant("the derivatives at a kink are those after it", "_loop/_tracks.py",
         "node = self.node(n, -kink, point)", "node = self.node(n, kink, point)",
