@@ -32,12 +32,17 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     a shorter step: of schemes up to order two, of `TunedLinear8`, of systems with
     constraints or on manifolds, in spans of fewer than three steps, where neighbouring
     steps of `diffrax.StepTo` differ by more than a factor of two, where friction over a
-    step is more than 0.5, and with `StepDensityController`. The statistics say which,
-    `sol.stats["interpolated"]`. A solve whose final or saved states are not finite
-    fails; of an explicit scheme it ends at the next saved time or end of a step that is
-    used for one, as other steps are not checked. For a time of `SaveAt(ts=...)` that is
-    NaN, a gap in measured times, nothing is saved: the row stays infinite, as do rows
-    after the end of a solve.
+    step is more than 0.5, or its matrix turns momenta by more than a radian, and with
+    `StepDensityController`. The statistics say which, `sol.stats["interpolated"]`. How
+    much friction by place, of a `LagrangianSystem` or in a `force` there is in a step
+    is not known: choose it by `choose_step` from a solve that saves the same times. The
+    force must have a derivative by `jax.jvp`.
+
+    A solve whose final or saved states are not finite fails; of an explicit scheme it
+    ends at the next saved time or end of a step that is used for one, as other steps
+    are not checked. For a time of `SaveAt(ts=...)` that is NaN, a gap in measured
+    times, nothing is saved: the row stays infinite, as do rows after the end of a
+    solve.
 
     For every solver of this package, with `diffrax.ConstantStepSize`, `StepsBetween`,
     `diffrax.StepTo` or `StepDensityController`, and any `SaveAt` but dense output. With

@@ -202,7 +202,7 @@ class Steps(AbstractSteps):
         return jnp.where(length > 0, length, 1)
 
     def largest_friction(self, system: System, last: Array) -> Float[Array, ""]:
-        """Over a step: the logarithm of a decay, or the angle of a rotation."""
+        """Over a step: the logarithm of a decay, or half of the angle of a rotation."""
         friction = system.friction
         assert friction is not None
 
