@@ -50,6 +50,11 @@ SCHEMES = {
     "Blanes-Moan 6": (dps.BlanesMoan6(), 6),
     "Compensated": (dps.Compensated(dps.Strang()), 2),
 }
+# Numbers of steps with errors that are neither of long steps nor of rounding.
+STEPS_OF = {
+    ("force", "Suzuki-Yoshida 6"): (32, 64, 128),
+    ("drag", "Blanes-Moan 6"): (8, 16, 32),
+}
 
 
 def breathing_sphere(friction, **options):
@@ -98,13 +103,13 @@ def order(errors):
 def test_order(friction, scheme):
     system, (solver, claimed) = breathing_sphere(friction), SCHEMES[scheme]
     y0, errors = start(system), []
-    for steps in (16, 32, 64):
+    for steps in STEPS_OF.get((friction, scheme), (16, 32, 64)):
         y = end(system, solver, y0, 2.0, steps)
         errors.append(np.max(np.abs(y - exact(friction))))
         q, p = map(jnp.asarray, np.split(y, 2))
         assert system.violation(2.0, q, p) < 2e-15
-    # Of the triple jumps long steps show less or more.
-    assert -0.5 < order(errors) - claimed < 0.7, errors
+    # Of the triple jumps long steps show more.
+    assert -0.3 < order(errors) - claimed < 0.6, errors
 
 
 @pytest.mark.parametrize("friction", FRICTION)
