@@ -123,13 +123,15 @@ def stack(x: PyTree, number: int) -> PyTree:
     return jtu.tree_map(lambda x: jnp.broadcast_to(x, (number, *jnp.shape(x))), x)
 
 
-def put(rows: PyTree, i: Array, value: PyTree, here: Any = True) -> PyTree:
+def put(
+    rows: PyTree, i: Array, value: PyTree, here: Any = True, axis: int = 0
+) -> PyTree:
     """Rows with one of them replaced, if it is `here`."""
 
     def leaf(xs, x):
         if here is not True:
-            x = jnp.where(here, x, xs[i])
-        return lax.dynamic_update_index_in_dim(xs, cast_to(x, xs), i, 0)
+            x = jnp.where(here, x, lax.dynamic_index_in_dim(xs, i, axis, False))
+        return lax.dynamic_update_index_in_dim(xs, cast_to(x, xs), i, axis)
 
     return jtu.tree_map(leaf, rows, value)
 
@@ -144,22 +146,17 @@ def put_here(rows: PyTree, i: Array, value: PyTree, here: Bool[Array, ""]) -> Py
 @functools.cache
 def _put_here(axis: int) -> Callable[..., Array]:
     @jax.custom_batching.custom_vmap
-    def put(xs: Array, x: Array, i: Array, here: Bool[Array, ""]) -> Array:
-        return lax.dynamic_update_index_in_dim(xs, x, i, axis)
+    def one(xs: Array, x: Array, i: Array, here: Bool[Array, ""]) -> Array:
+        return put(xs, i, x, axis=axis)
 
-    @put.def_vmap
+    @one.def_vmap
     def _(size: int, batched: list[bool], xs, x, i, here):
         each = lambda x, known: x if known else stack(x, size)
         xs, x = map(each, (xs, x), batched[:2])
         if not (batched[2] or batched[3]):
             return _put_here(axis + 1)(xs, x, i, here), True
-
-        def masked(xs, x, i, here):
-            old = lax.dynamic_index_in_dim(xs, i, axis, keepdims=False)
-            x = jnp.where(here, x, old)
-            return lax.dynamic_update_index_in_dim(xs, x, i, axis)
-
         i, here = map(each, (i, here), batched[2:])
+        masked = lambda xs, x, i, here: put(xs, i, x, here, axis)
         return jax.vmap(masked)(xs, x, i, here), True
 
-    return put
+    return one
