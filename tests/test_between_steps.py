@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
-import scipy.linalg
 
 import diffrax_presym as dps
 from diffrax_presym._results import FRICTION_TOO_STRONG
@@ -138,54 +137,6 @@ def test_strong_friction_takes_shorter_steps(gamma):
     right = exact(gamma, TS)
     for here, all_times in errors(sol.ys, right, slice(None, None, 4)):
         assert all_times <= 10 * here
-
-
-@pytest.mark.parametrize("rate, interpolated", [(1.8, True), (8.0, False)])
-def test_a_fast_rotation_takes_shorter_steps(rate, interpolated):
-    """A magnetic field, of which drifts are exact however much they turn."""
-    C = rate * np.array([[0.0, 1.0], [-1.0, 0.0]])
-    law = dps.ViscousDamping(jnp.asarray(C))
-    well = lambda t, q, args: jnp.sum(q**2) / 2
-    system = dps.MechanicalSystem(dps.QuadraticKinetic(), well, law)
-    ts, y0 = np.linspace(0.0, 10.0, 81), np.array([1.0, -0.5, 1.0, 1.0])
-    sol: Any = dfx.diffeqsolve(
-        *(system, dps.TunedRKN6(), 0.0, 10.0, 0.5, tuple(jnp.split(jnp.array(y0), 2))),
-        saveat=dfx.SaveAt(ts=jnp.asarray(ts)),
-        adjoint=dps.FixedStepAdjoint(),
-    )
-    assert bool(sol.stats["interpolated"]) == interpolated
-    A = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.eye(2), -C]])
-    right = np.stack([scipy.linalg.expm(t * A) @ y0 for t in ts])
-    error = np.abs(np.concatenate(sol.ys, axis=1) - right)
-    assert np.max(error) < 3 * np.max(error[::4])
-
-
-@pytest.mark.parametrize("solver", [dps.BlanesMoan4(), GAUSS(3)])
-def test_a_speed_has_no_derivative_at_rest(solver):
-    drag = lambda t, q, v, args: args * jnp.linalg.norm(v) * v
-    push = lambda t, q, args: q[1] * (1 + t)
-    ball = dps.MechanicalSystem(dps.QuadraticKinetic(), push, force=drag)
-    ts = np.linspace(0.0, 1.0, 23)
-
-    def saved(c) -> Any:
-        return dfx.diffeqsolve(
-            *(ball, solver, 0.0, 1.0, 0.05, (jnp.zeros(2), jnp.zeros(2)), -c),
-            saveat=dfx.SaveAt(ts=jnp.asarray(ts)),
-            adjoint=dps.FixedStepAdjoint(),
-        ).ys
-
-    def slope(t, y):
-        return [y[1], -(1 + t) - 0.5 * abs(y[1]) * y[1]]
-
-    options: dict[str, Any] = {"rtol": 1e-12, "atol": 1e-13, "method": "DOP853"}
-    right = scipy.integrate.solve_ivp(slope, (0, 1), [0, 0], t_eval=ts, **options).y
-    got = np.stack([x[:, 1] for x in saved(0.5)])
-    np.testing.assert_allclose(got, right, 0, 2e-8)
-    if solver != GAUSS(3):
-        return  # JAX has no derivative of the norm in a kick at rest.
-    total = lambda c: jnp.sum(saved(c)[1])
-    difference = (total(0.5 + 1e-5) - total(0.5 - 1e-5)) / 2e-5
-    assert jax.grad(total)(0.5) == pytest.approx(float(difference), rel=1e-7)
 
 
 def test_few_steps_and_schemes_of_order_two_take_shorter_steps():

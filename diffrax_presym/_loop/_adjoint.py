@@ -34,8 +34,9 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     steps of `diffrax.StepTo` differ by more than a factor of two, where friction over a
     step is more than 0.5, or its matrix turns momenta by more than a radian, and with
     `StepDensityController`. The statistics say which, `sol.stats["interpolated"]`. How
-    much friction by place, of a `LagrangianSystem` or in a `force` there is in a step
-    is not known: choose it by `choose_step` from a solve that saves the same times. The
+    strong friction by place or by speed, of a `LagrangianSystem` or in a `force` is, is
+    estimated at the start of the solve alone (a relaxation of 1 over a step): if it
+    grows, choose the step by `choose_step` from a solve that saves the same times. The
     force must have a derivative by `jax.jvp`.
 
     A solve whose final or saved states are not finite fails; of an explicit scheme it

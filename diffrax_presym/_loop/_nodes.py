@@ -5,6 +5,7 @@ time, the nodes, and their first two derivatives along the motion.
 """
 
 import math
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -28,6 +29,9 @@ _MOST_FRICTION = 0.5
 # The largest ratio of neighbouring steps.
 _MOST_RATIO = 2.0
 
+# Power iterations for the rate of friction that depends on the state.
+_ITERATIONS = 8
+
 # A state and its first two derivatives.
 Node = tuple[State, State, State]
 
@@ -46,11 +50,42 @@ def derivatives(
 
     first, known = slope(t, y, force), y
     along = jnp.ones_like(t), first
-    if getattr(system.term, "external", None) is not None:
-        # A speed has no derivative at rest, but one a moment later.
-        moment = float(jnp.finfo(h.dtype).eps) ** (2 / 3) * jnp.where(side < 0, -h, h)
+    if _external(system) is not None:
+        moment = _moment(jnp.where(side < 0, -h, h))
         t, y = t + cast_to(moment, t), tree.add_scaled(y, moment, first)
     return known, first, jax.jvp(slope, (t, y), along)[1]
+
+
+def _external(system: System) -> Callable | None:
+    return getattr(system.term, "external", None)
+
+
+def _moment(h: Array) -> Array:
+    """A speed has no derivative at rest, but one a moment later."""
+    return float(jnp.finfo(h.dtype).eps) ** (2 / 3) * h
+
+
+def _rate(system: System, t: Array, y: State, h: Array) -> Float[Array, ""]:
+    """At the start, the largest rate at which friction that depends on the state, and
+    forces of the velocity, change momenta: of their derivative, by power iteration."""
+    y, force = system.values(y), _external(system)
+    q, p = tree.add_scaled(y, _moment(h), system.slope(t, y))
+
+    def other(p: PyTree) -> PyTree:
+        v = system.velocity(t, (q, p))
+        return system.term.add_forces(tree.zeros(p), force, t, q, p, v, system.args)
+
+    def iterate(_, x: tuple[PyTree, Array]) -> tuple[PyTree, Array]:
+        u = x[0]
+        change = jax.jvp(other, (p,), (u,))[1]
+        size = jnp.sqrt(tree.dot(change, change) / tree.dot(u, u))
+        u = tree.scale(1 / jnp.where(size == 0, 1, size), change)
+        return tree.where(size == 0, x[0], u), size.astype(h.dtype)
+
+    generic = lambda x: jnp.cos(jnp.arange(1.0, x.size + 1)).reshape(x.shape)
+    first = jtu.tree_map(lambda x: cast_to(generic(x), x), p)
+    start = first, jnp.zeros_like(h)
+    return jnp.abs(lax.fori_loop(0, _ITERATIONS, iterate, start)[1])
 
 
 class Ways(eqx.Module):
@@ -61,12 +96,16 @@ class Ways(eqx.Module):
     some: Bool[Array, ""]
     others: Bool[Array, ""]  # whether any are not
 
-    def __init__(self, system: System, steps: Steps, last: Array):
+    def __init__(self, system: System, steps: Steps, last: Array, y: State):
         yes = jnp.minimum(steps.fewest, last) >= NODES - 1
         yes &= steps.ratio <= _MOST_RATIO
         if system.friction is not None:
             most = lax.stop_gradient(steps.largest_friction(system, last))
             yes &= most <= _MOST_FRICTION
+        if any(system.parts[1:]) or _external(system) is not None:
+            h = steps.longest
+            most = jnp.abs(h) * _rate(system, system.time(steps.t0), y, h) / 2
+            yes &= lax.stop_gradient(most) <= _MOST_FRICTION
         self.interpolated, self.some, self.others = (
             yes,
             tree.any_member(yes),

@@ -91,7 +91,7 @@ class Problem(eqx.Module):
                 ),
                 *(n, n, start),
             )
-            ways = Ways(system, steps, self.last)
+            ways = Ways(system, steps, self.last, start[0])
             for i, rows in enumerate(self.rows):
                 if rows.may_be_inside:
                     stencils = Stencils(steps, rows, self.last, ways)

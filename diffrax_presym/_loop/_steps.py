@@ -201,6 +201,10 @@ class Steps(AbstractSteps):
             length = self.ts[n + 1] - self.ts[n]
         return jnp.where(length > 0, length, 1)
 
+    @property
+    def longest(self) -> Float[Array, ""]:
+        return jnp.max(self.length if self.ts is None else jnp.diff(self.ts))
+
     def largest_friction(self, system: System, last: Array) -> Float[Array, ""]:
         """Over a step: the logarithm of a decay, or half of the angle of a rotation."""
         friction = system.friction
