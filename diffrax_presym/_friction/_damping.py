@@ -121,7 +121,7 @@ class LogDamping(AbstractDamping):
     from zero momentum; there splittings with a quadratic kinetic energy have at most
     order `γ + 1`, and other schemes order 2. Schemes whose stages extend beyond the
     step, such as `SuzukiYoshida`, must start far enough from there; otherwise the solve
-    fails.
+    fails. Backwards in time the momentum is infinite there: end before it.
     """
 
     gamma: Numbers
@@ -155,7 +155,7 @@ class PowerDamping(AbstractDamping):
     França, Jordan and Vidal (2021) is `friction=[LogDamping(gamma1),
     PowerDamping(gamma2, delta)]`. Time must not be negative; from `t = 0`, where the
     rate is infinite for an exponent below 1, a solve may start from zero momentum, with
-    order 2.
+    order 2. Backwards in time end before it, or the solve fails.
     """
 
     gamma: Numbers
