@@ -17,7 +17,7 @@ from ._scheme._engine import (
     MoveSequence as MoveSequence,
     Span as Span,
 )
-from ._scheme._moves import Drift as Drift, Kick as Kick
+from ._scheme._moves import Drift as Drift, Enter as Enter, Kick as Kick
 from ._system._base import AbstractSystem as AbstractSystem
 from ._system._bound import System as System
 from ._system._kinetic import AbstractKinetic as AbstractKinetic

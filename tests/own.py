@@ -62,6 +62,7 @@ class DrivenKick(extend.AbstractMove):
     """A kick, and one by `cos(t)` prepared less `cos(t)` as it is."""
 
     kick: extend.Kick = extend.Kick("any", 2)
+    keeps_manifold: ClassVar[bool] = True
 
     def prepare(self, system, span):
         return jnp.cos(span.t0)
@@ -98,17 +99,24 @@ class _Leapfrog(extend.AbstractPresymplecticSolver):
     def order(self, terms):
         return 2
 
-    def _scheme(self, kick):
+    def _scheme(self, kick, ends=None):
         drift = extend.Drift("any", 2)
         table = [(0, 0.5, 0.5), (0.5, 0.5, 1), (0.5, 1, 0.5)]
-        return extend.Scheme(extend.MoveSequence([drift, kick, drift], table))
+        return extend.Scheme(extend.MoveSequence([drift, kick, drift], table), ends)
 
 
 class DrivenLeapfrog(_Leapfrog):
     def scheme(self, system):
         if system.split("any") is None:
             raise ValueError("Use `PresymplecticGauss()`: the system has no split.")
-        return self._scheme(DrivenKick())
+        return self._scheme(DrivenKick(), extend.Enter("any"))
+
+
+class BareLeapfrog(_Leapfrog):
+    """Whose moves do not say where they start from."""
+
+    def scheme(self, system):
+        return self._scheme(extend.Kick("any", 2))
 
 
 class SpringLeapfrog(_Leapfrog):

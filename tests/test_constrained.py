@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import own
 import pytest
 from on_manifolds import bobs, by_scipy, end_as_vector as end, links
 
@@ -281,6 +282,7 @@ def test_an_initial_state_off_the_constraint(q, p, most, adjoint):
         *(dps.PresymplecticLeapfrog(), dps.PresymplecticEuler(), dps.TunedRKN6()),
         *(dps.PresymplecticGauss(2), dps.PresymplecticTao(), dps.TunedLinear8()),
         *(dps.SymmetricMultistep(8), dps.SuzukiYoshida(4)),
+        *(own.SpringLeapfrog(), dps.Suzuki4(own.SpringLeapfrog())),
     ],
     ids=lambda x: type(x).__name__,
 )
@@ -288,6 +290,23 @@ def test_schemes_that_leave_the_constraint_refuse(solver):
     y0 = jnp.array([1.0, 0.0, 0.0]), jnp.zeros(3)
     with pytest.raises(ValueError, match=r"would leave the manifold.*Strang"):
         diffeqsolve(sphere(), solver, 0.0, 1.0, 0.1, y0)
+
+
+def test_own_moves_say_that_they_start_from_other_variables():
+    """Otherwise momenta at the ends of steps are not tangential."""
+    y0 = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.5])
+    with pytest.raises(ValueError, match=r"BareLeapfrog.*ends=Enter\("):
+        diffeqsolve(sphere(), own.BareLeapfrog(), 0.0, 1.0, 0.1, y0)
+    right = end(sphere(), dps.BlanesMoan6(), y0, 1.0, 50)
+    for loop in (dps.FixedStepAdjoint(), dfx.RecursiveCheckpointAdjoint()):
+        found = [
+            end(sphere(), own.DrivenLeapfrog(), y0, 1.0, n, adjoint=loop)
+            for n in (10, 20)
+        ]
+        for y in found:
+            assert sphere().violation(1.0, *jnp.split(y, 2)) < 1e-13
+        errors = [np.max(np.abs(y - right)) for y in found]
+        assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.1)
 
 
 def test_arguments():

@@ -20,6 +20,7 @@ from ._engine import (
     first_failure,
     forward,
     inverse,
+    leaves,
     Moves,
     MoveSequence,
     prepare,
@@ -27,6 +28,7 @@ from ._engine import (
     Span,
 )
 from ._failure import explain, unless_too_strong
+from ._moves import Drift, Enter, Kick
 from ._strong_friction import Pattern
 
 
@@ -105,7 +107,9 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver):
         term, _ = unwrap(terms)  # An error if it is another term.
         term.check_state(y0)
         system = bind(terms, args, y0)
-        return self.scheme(system).start(system, system.time(t0), y0)
+        scheme = self.scheme(system)
+        check_moves(self, system, scheme)
+        return scheme.start(system, system.time(t0), y0)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         system = bind(terms, args, y0)
@@ -201,6 +205,26 @@ def refuse_constrained(solver: AbstractPresymplecticSolver, system: System) -> N
             f"`{system.name}`. Use `Strang()`, `BlanesMoan4()` or `BlanesMoan6()`, or "
             "compositions such as `SofroniouSpaletta(6, Strang())`."
         )
+
+
+def check_moves(
+    solver: AbstractPresymplecticSolver, system: System, scheme: Scheme
+) -> None:
+    """An error if the moves of a scheme, which may be a user's, do not fit a system."""
+    moves = leaves(scheme.moves)
+    if not all(move.keeps_manifold for move in moves):
+        refuse_constrained(solver, system)
+    entered = [move.kind for move in moves if isinstance(move, Enter)]
+    for move in moves:
+        if not isinstance(move, Drift | Kick) or move.kind in entered:
+            continue
+        split = system.split(move.kind)
+        if split is not None and split.has_variables:
+            raise ValueError(
+                f"The moves of `{type(solver).__name__}` are those of a split of "
+                f"`{system.name}` that has variables of its own. Write `Scheme(moves, "
+                f'ends=Enter("{move.kind}"))`.'
+            )
 
 
 def check_base(base) -> None:

@@ -6,9 +6,10 @@ time alone is prepared, for all stages at once, and what touches the state is ap
 """
 
 import abc
+import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import ClassVar, NamedTuple, TypeAlias
 
 import diffrax as dfx
 import equinox as eqx
@@ -62,6 +63,10 @@ class AbstractMove(eqx.Module):
 
     The inverse is called with the reversed span, and what was prepared for that.
     """
+
+    # Whether it keeps states on the constraints or the manifold of a system. Schemes
+    # with a move that does not refuse such systems.
+    keeps_manifold: ClassVar[bool] = False
 
     @abc.abstractmethod
     def apply(
@@ -141,6 +146,13 @@ def inverse(moves: Moves) -> Moves:
     if isinstance(moves, MoveSequence):
         return moves.inverse
     return moves.move if isinstance(moves, Inverse) else Inverse(moves)
+
+
+def leaves(moves: Moves) -> list[AbstractMove]:
+    """The moves of all sequences in it, without inverses."""
+    if isinstance(moves, MoveSequence):
+        return list(itertools.chain(*map(leaves, moves.moves)))
+    return [moves.move if isinstance(moves, Inverse) else moves]
 
 
 def is_autonomous(moves: Moves, system: System) -> bool:

@@ -4,6 +4,8 @@ The state within a step is a pair: `(q, p)`, and at the ends of a step the force
 if the scheme starts with a kick.
 """
 
+from typing import ClassVar
+
 import equinox as eqx
 from jaxtyping import PyTree
 
@@ -13,9 +15,11 @@ from ._engine import AbstractMove, Outcome, Span, StepState
 
 
 class Enter(AbstractMove):
-    """From `(q, p)` to the variables of a split; the inverse goes back."""
+    """From `(q, p)` to the variables of a split, for `Scheme(..., ends=Enter(kind))`;
+    the inverse goes back."""
 
     kind: str = eqx.field(static=True)
+    keeps_manifold: ClassVar[bool] = True
 
     def apply(
         self, system: System, span: Span, data: None, stage: StepState
@@ -33,6 +37,7 @@ class Drift(AbstractMove):
 
     kind: str = eqx.field(static=True)
     order: int = eqx.field(static=True)
+    keeps_manifold: ClassVar[bool] = True
 
     def prepare(self, system: System, span: Span) -> PyTree:
         split = system.split(self.kind)
@@ -64,6 +69,7 @@ class Kick(AbstractMove):
     kind: str = eqx.field(static=True)
     order: int = eqx.field(static=True)
     known: bool = eqx.field(static=True, default=False)
+    keeps_manifold: ClassVar[bool] = True
 
     def apply(
         self, system: System, span: Span, data: None, stage: StepState
@@ -80,17 +86,20 @@ class Kick(AbstractMove):
         return (y, force if self.known else carry), None
 
 
-_ARGUMENTS = """**Arguments:**
+_KIND = """**Arguments:**
 
 - `kind`: the kind of split that the system must offer: `"separable"`, `"any"`,
     `"nystrom"`, `"shared"` or `"linear"`.
-- `order`: the order in the step to which a flow without closed form is computed.
 """
-Drift.__init__.__doc__ = _ARGUMENTS
+_ORDER = """- `order`: the order in the step to which a flow without closed form is
+    computed.
+"""
+Enter.__init__.__doc__ = _KIND
+Drift.__init__.__doc__ = _KIND + _ORDER
 _KNOWN = """- `known`: whether the kick starts a step, by the force that the last step
     left; its inverse ends a step, and leaves the force. Defaults to `False`.
 """
-Kick.__init__.__doc__ = _ARGUMENTS + _KNOWN
+Kick.__init__.__doc__ = _KIND + _ORDER + _KNOWN
 
 
 class FrozenDrift(AbstractMove):
@@ -124,6 +133,8 @@ class ToSums(AbstractMove):
 
     The solver state is `(carry, rounding errors)` outside, and `carry` within.
     """
+
+    keeps_manifold: ClassVar[bool] = True
 
     def apply(
         self, system: System, span: Span, data: None, stage: StepState

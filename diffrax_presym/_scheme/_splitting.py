@@ -9,7 +9,6 @@ from jaxtyping import Array, PyTree
 from .._compositions import substeps
 from .._numbers import State
 from .._system._bound import System
-from .._system._split import AbstractSplit
 from ._base import AbstractPresymplecticSolver, Scheme
 from ._engine import inverse, Moves, MoveSequence
 from ._find_split import find_split
@@ -69,10 +68,9 @@ class AbstractSplitting(AbstractPresymplecticSolver):
             start = Kick(kind, order, known=True)
             moves = [start, *moves, inverse(start)]
             spans = [(0, 0, kicks[0]), *spans, (1, 1, kicks[-1])]
-        changes = type(split).leave is not AbstractSplit.leave
         scheme = Scheme(
             MoveSequence(moves, spans),
-            Enter(kind) if changes else None,
+            Enter(kind) if split.has_variables else None,
             # Interpolated values would be off the manifold.
             is_resolved=kind != "linear" and not system.term.is_constrained,
             most_friction=most,

@@ -63,6 +63,11 @@ class AbstractSplit(eqx.Module):
         """Back to `(q, p)`, at the end of a step."""
         return y
 
+    @property
+    def has_variables(self) -> bool:
+        """Whether it acts on other variables than `(q, p)`."""
+        return type(self).leave is not AbstractSplit.leave
+
     def attempt(
         self, system: "System", t: Time, h: Time, data: PyTree, y: State
     ) -> tuple[State, dfx.RESULTS | None]:
