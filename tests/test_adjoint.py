@@ -196,6 +196,26 @@ def test_without_max_steps():
     assert_close(ours, value_and_gradient(INPUTS, CHECKPOINTED, {}), 1e-12)
 
 
+@pytest.mark.parametrize("checkpoints", [None, 20])
+def test_strong_friction_by_place_keeps_as_many_states_as_there_are(checkpoints):
+    def loss(strength, adjoint):
+        rate = lambda t, q, args: 30 * strength * jnp.exp(-(q**2))
+        pendulum = lambda t, q, args: -jnp.sum(jnp.cos(q))
+        law = dps.PositionDamping(rate)
+        system = dps.MechanicalSystem(dps.QuadraticKinetic(), pendulum, law)
+        start = jnp.array([1.5, -0.3]), jnp.array([0.2, 0.4])
+        sol: Any = dfx.diffeqsolve(
+            *(system, dps.BlanesMoan6(), 0.0, 4.0, 0.2, start),
+            **{"adjoint": adjoint, "max_steps": 100},
+        )
+        return jnp.sum(sol.ys[0] ** 2)
+
+    by = dps.FixedStepAdjoint(checkpoints=checkpoints)
+    got, h = jax.jit(jax.grad(lambda x: loss(x, by)))(1.0), 1e-5
+    difference = (loss(1 + h, by) - loss(1 - h, by)) / (2 * h)
+    assert got == pytest.approx(float(difference), rel=1e-7)
+
+
 def test_second_derivatives_by_forward_over_reverse():
     def hessian_vector(adjoint):
         gradient = jax.grad(lambda x: add_up(solve(x, adjoint).ys) ** 2)

@@ -263,6 +263,19 @@ def test_too_stiff_for_the_step(solver, adjoint):
         solve(20, throw=True)
 
 
+@pytest.mark.parametrize("solver", SCHEMES, ids=lambda x: type(x).__name__)
+@pytest.mark.parametrize("step", [0.03, 0.1, 0.3])
+@pytest.mark.parametrize("width", [1e-5, 1e-7, 0.0])
+def test_a_force_that_is_flat_where_a_kick_ends_is_too_stiff(solver, step, width):
+    """Where its steep part throws the momentum, the equation of a kick converges."""
+    rub = lambda t, q, v, args: -jnp.tanh(v / width) if width else -jnp.sign(v)
+    system = dps.MechanicalSystem(UNIT, spring, force=rub)
+    start = jnp.array([5.0, 3.0]), jnp.zeros(2)
+    n = int(20 / step)
+    y, result = ends(system, solver, 20.0, n, start)
+    assert result != successful or np.max(np.abs(np.stack(y))) < 6
+
+
 def test_a_member_of_a_batch_fails_alone():
     def one(width):
         rub = lambda t, q, v, args: -jnp.tanh(v / width)

@@ -173,3 +173,21 @@ def test_other_systems_are_refused():
     system = dps.Hamiltonian(lambda t, q, p, args: jnp.sum(p**2) / 2)
     with pytest.raises(ValueError, match="or a `ManifoldSystem`, but got Hamiltonian"):
         dps.ConstrainedSystem(system, joints)
+
+
+@pytest.mark.parametrize("law", ["place", "drag"])
+def test_power_lost_is_that_of_the_bodies_alone(law):
+    """Of angular velocities, not of the rates of change of quaternions."""
+    rates = lambda t, q, args: (jnp.array(0.3), jnp.array(0.2))
+    friction = dps.Drag(0.3) if law == "drag" else dps.ViscousDamping(rates)
+    system = pendulum(friction)
+    y = in_plane(np.array([0.4, -0.3]), np.array([0.7, 1.1]))
+    v = np.asarray(y[1][0]) / MASS[:, None], np.asarray(y[1][1]) / INERTIA
+    if law == "drag":
+        wanted = 0.3 * sum(np.sum(np.linalg.norm(x, axis=-1) ** 3) for x in v)
+    else:
+        wanted = 0.3 * np.sum(v[0] ** 2) + 0.2 * np.sum(v[1] ** 2)
+    many = jax.tree.map(lambda x: jnp.asarray(x)[None], y)
+    for each in (system, system.system):
+        (found,) = dps.diagnostics.power_lost(each, jnp.zeros(1), many)
+        assert found == pytest.approx(wanted, rel=1e-13)

@@ -155,7 +155,8 @@ class PowerDamping(AbstractDamping):
     França, Jordan and Vidal (2021) is `friction=[LogDamping(gamma1),
     PowerDamping(gamma2, delta)]`. Time must not be negative; from `t = 0`, where the
     rate is infinite for an exponent below 1, a solve may start from zero momentum, with
-    order 2. Backwards in time end before it, or the solve fails.
+    order `1 + δ`, or 2 beside `LogDamping`. Backwards in time end before it, or the
+    solve fails.
     """
 
     gamma: Numbers

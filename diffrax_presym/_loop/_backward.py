@@ -239,6 +239,8 @@ class PullNodes(AbstractPull):
     def start(self, backward):
         n, node = backward.trace.n, (backward.trace.end[0],) * 3
         number, _ = backward.trace.between[self.i]
+        # In a batch a member that failed is visited with the others.
+        number = jnp.minimum(number, jnp.sum(self.stencils.last[:-1] <= n))
         return n + 1, n + 1, number, _zeros(stack(node, NODES))
 
     def due(self, state, n):

@@ -5,7 +5,6 @@ time, the nodes, and their first two derivatives along the motion.
 """
 
 import math
-from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -50,14 +49,10 @@ def derivatives(
 
     first, known = slope(t, y, force), y
     along = jnp.ones_like(t), first
-    if _external(system) is not None:
+    if system.external is not None:
         moment = _moment(jnp.where(side < 0, -h, h))
         t, y = t + cast_to(moment, t), tree.add_scaled(y, moment, first)
     return known, first, jax.jvp(slope, (t, y), along)[1]
-
-
-def _external(system: System) -> Callable | None:
-    return getattr(system.term, "external", None)
 
 
 def _moment(h: Array) -> Array:
@@ -68,7 +63,7 @@ def _moment(h: Array) -> Array:
 def _rate(system: System, t: Array, y: State, h: Array) -> Float[Array, ""]:
     """At the start, the largest rate at which friction that depends on the state, and
     forces of the velocity, change momenta: of their derivative, by power iteration."""
-    y, force = system.values(y), _external(system)
+    y, force = system.values(y), system.external
     q, p = tree.add_scaled(y, _moment(h), system.slope(t, y))
 
     def other(p: PyTree) -> PyTree:
@@ -102,7 +97,7 @@ class Ways(eqx.Module):
         if system.friction is not None:
             most = lax.stop_gradient(steps.largest_friction(system, last))
             yes &= most <= _MOST_FRICTION
-        if any(system.parts[1:]) or _external(system) is not None:
+        if system.has_unknown_friction:
             h = steps.longest
             most = jnp.abs(h) * _rate(system, system.time(steps.t0), y, h) / 2
             yes &= lax.stop_gradient(most) <= _MOST_FRICTION

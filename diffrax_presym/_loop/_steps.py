@@ -299,6 +299,8 @@ class Steps(AbstractSteps):
         return explain(scheme, system, partial(self.span, system), n, timed, result)
 
     def growth(self, system, last):
+        if system.has_unknown_friction:
+            return jnp.full_like(self.t0, jnp.inf)
         if system.friction is None:
             return None
         # The first step after a kept state is not inverted.

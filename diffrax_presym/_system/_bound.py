@@ -1,5 +1,6 @@
 """The interface between solvers and systems."""
 
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import diffrax as dfx
@@ -98,6 +99,17 @@ class System(eqx.Module):
         return dfx.RESULTS.where(valid, dfx.RESULTS.successful, NONFINITE)
 
     # Friction.
+
+    @property
+    def external(self) -> Callable | None:
+        """A user's force of the velocity."""
+        return getattr(self.term, "external", None)
+
+    @property
+    def has_unknown_friction(self) -> bool:
+        """Whether there is friction, or a force of the velocity, that depends on the
+        state."""
+        return any(self.parts[1:]) or self.external is not None
 
     def prepare_decay(self, t: Time, h: Time) -> PyTree:
         """What the decay of a momentum from `t` to `t + h` needs of time alone."""

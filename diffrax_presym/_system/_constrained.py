@@ -77,8 +77,9 @@ class ConstrainedSystem(AbstractSystem):
             `ManifoldSystem`, such as rigid bodies that are joined; with any friction
             and any forces of the velocity.
         - `constraint`: a function `g(t, q, args)` that returns an array, zero where the
-            constraints hold, or a scalar. A solve fails from a state where it is not
-            zero to 1e-8, so scale it: `q @ q / length**2 - 1`.
+            constraints hold, or a scalar. A solve fails from a state where it, or its
+            rate of change, is not zero to 1e-8, so scale it, `q @ q / length**2 - 1`,
+            and take a unit of time in which velocities are not large or tiny.
         - `linear_solver`: a Lineax solver for the multipliers. Defaults to `None`, by
             their matrix. For a chain, in which constraints share coordinates with their
             neighbours alone, and neither mass nor friction joins others, the cost of
@@ -129,6 +130,11 @@ class ConstrainedSystem(AbstractSystem):
 
     def check_state(self, y: PyTree) -> None:
         self.system.check_state(y)
+
+    def add_forces(
+        self, force: P, external: Callable | None, t: Time, q: Q, p: P, v: Q, args
+    ) -> P:
+        return self.system.add_forces(force, external, t, q, p, v, args)
 
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         return self.system.energy(t, q, p, args)

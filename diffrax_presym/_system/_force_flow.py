@@ -54,7 +54,13 @@ def force_flow(
     # Traced once, with all that it depends on, to be differentiated.
     end, known = eqx.filter_closure_convert(end, p), derivatives(p)
     equation, guess = _Equation(p, series(pade, known), end), series(taylor, known)
-    return implicit(equation, guess, find=_iterate, tangent=contract)
+    change, found = implicit(equation, guess, find=_iterate, tangent=contract)
+    if k > 1:
+        # The inverse does not converge to a start where the slope is too large, and a
+        # force that is flat at the end of the step may hide that.
+        sizes = [tree.dot(x, x) for x in tree.stop_gradient(known[:2])]
+        found &= h * h * sizes[1] <= _STIFF**2 * sizes[0]
+    return change, found
 
 
 def _derivatives(force: _Force, p: PyTree, number: int) -> list[PyTree]:
@@ -73,6 +79,7 @@ def _derivatives(force: _Force, p: PyTree, number: int) -> list[PyTree]:
 _NEGLIGIBLE = 1 / 8  # largest estimated change of another iteration to stop
 _ROUNDING = 16.0  # largest change at which stagnation is attributed to rounding
 _MOST = 128  # iterations
+_STIFF = 4.0  # slope times length, about twice that at which iterations diverge
 
 
 def _iterate(equation: _Equation, guess: PyTree) -> tuple[PyTree, Bool[Array, ""]]:
