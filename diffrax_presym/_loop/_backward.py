@@ -238,9 +238,7 @@ class PullNodes(AbstractPull):
 
     def start(self, backward):
         n, node = backward.trace.n, (backward.trace.end[0],) * 3
-        number, _ = backward.trace.between[self.i]
-        # In a batch a member that failed is visited with the others.
-        number = jnp.minimum(number, jnp.sum(self.stencils.last[:-1] <= n))
+        number = jnp.argmax(self.stencils.last > n)  # the first that is not known
         return n + 1, n + 1, number, _zeros(stack(node, NODES))
 
     def due(self, state, n):
@@ -260,7 +258,7 @@ class PullNodes(AbstractPull):
             _, bar = backward.row(i, int(problem.subs[i].t0) + j, taken)
             # Of the others nothing may fail of which a gradient takes zero times.
             time = jnp.where(taken, rows.time[j], problem.steps.t0)
-            y = jtu.tree_map(lambda x: x[j], backward.trace.between[i][1])
+            y = jtu.tree_map(lambda x: x[j], backward.trace.between[i])
             y = tree.where(taken, y, start)
             output = lambda functions, y: functions.outputs[i](time, y)
             more, bar = backward.pull(output, bar, y)

@@ -46,8 +46,7 @@ class Trace(eqx.Module):
 
     n: Int[Array, ""]
     end: Point
-    # The number of interpolated rows and the states in them, of each output.
-    between: list[PyTree]
+    between: list[PyTree]  # the states in interpolated rows, of each output
     kept: PyTree  # the steps whose starting states are kept, and these
     before: Point | None  # as in `Progress`
     rows: list[Rows]  # of which the steps are known now
@@ -75,8 +74,7 @@ def run(problem: Problem, kept: AbstractTrack | None = None):
             values, each = at_steps
             good = jnp.all(each | ~rows.taken(progress.n))
             if inside is not None:
-                number, (new, ys), nodes = inside
-                ys = number, ys
+                (new, ys), nodes = inside
                 stencils = problem.stencils[i]
                 assert stencils is not None
                 way = stencils.ways.interpolated

@@ -115,8 +115,8 @@ class Interpolated(AbstractTrack):
         return jnp.where(here, n + 1, due), j, ring, rows, finite
 
     def rows(self, state):
-        """Their number, they, and whether all nodes were finite."""
-        return state[1], *state[3:]
+        """They, and whether all nodes were finite."""
+        return state[3:]
 
 
 def stack(x: PyTree, number: int) -> PyTree:
