@@ -98,6 +98,28 @@ def test_derivatives(body, s):
     np.testing.assert_allclose(by_time[4:], jnp.cross(p, p / inertia), atol=1e-11)
 
 
+SECOND = jax.jit(jax.jacfwd(jax.jacrev(lambda p, *of: flow(of[0], state(p), of[1]))))
+
+
+@pytest.mark.parametrize("body", ["asymmetric", "symmetric, long", "a rod"])
+def test_second_derivatives(body):
+    """At both sides of where a rotation is taken as small. That by a momentum `a p`
+    over a time is that by `p` over `a` times it, so they are differences of first
+    derivatives of rotations that are not small."""
+    inertia, p = map(np.array, BODIES[body])
+    unit = np.min(inertia)
+    slope = lambda x: DERIVATIVES[0](jnp.asarray(x), jnp.asarray(inertia), 1.0)[0][:4]
+    for s in 1e-9, 5e-6, 5e-5, 2e-4, 1e-3, 1e-2:
+        found = SECOND(jnp.asarray(p), jnp.asarray(inertia), s * unit)[:4]
+        steps = 0.01 * unit * np.eye(3)
+        around = lambda k, s=s, steps=steps: np.stack(
+            [slope(s * unit * p + k * x) for x in steps], axis=-1
+        )
+        near, far = (around(k) - around(-k) for k in (1, 2))
+        exact = (8 * near - far) / 0.12
+        np.testing.assert_allclose(found / (s**2 * unit), exact, atol=1e-7 / unit)
+
+
 @pytest.mark.parametrize("body", ["asymmetric", "a rod", "symmetric, long"])
 def test_long_steps_are_right_or_fail(body):
     inertia, p = map(np.array, BODIES[body])

@@ -129,16 +129,27 @@ def _momentum(p: Three, rates: Three, s: Array) -> Three:
 
 
 def _is_small(p: Vectors, rates: Vectors, s: Array) -> Bool[Array, "..."]:
-    limit = float(jnp.finfo(p.dtype).eps) ** (2 / 3)
+    limit = float(jnp.finfo(p.dtype).eps) ** 0.5
     return jnp.sum(p**2, axis=-1) * (s * jnp.max(rates, axis=-1)) ** 2 <= limit
+
+
+def _small_angle(start: Three, end: Three, rates: Three, s: Array) -> Three:
+    """The vector of a small rotation, by the momenta at its ends, to the fourth order:
+    the mean velocity by that of Hermite, and the first commutator of Magnus."""
+    u, v = (_each(jnp.multiply, x, rates) for x in (start, end))
+    bend = _each(jnp.subtract, _cross(start, u), _cross(end, v))
+    first = lambda u, v, bend, rate, both: (
+        s / 2 * (u + v) + s**2 / 12 * (rate * bend + both)
+    )
+    return _each(first, u, v, bend, rates, _cross(u, v))
 
 
 @eqx.filter_custom_jvp
 def _rotation(p: Vectors, rates: Vectors, s: Array) -> tuple[Quaternions, Vectors]:
     # Through the momentum in the middle: from that at the end to it, by an angle about
     # it, and on to that at the start, each of the first and the last by the shortest
-    # rotation. The angle is an integral. A small rotation is that by the mean velocity,
-    # as these are not defined for a body at rest.
+    # rotation. The angle is an integral. A small rotation is by a series, as these are
+    # not defined for a body at rest.
     is_small = _is_small(p, rates, s)
     start, each = _entries(p), _entries(rates)
     momentum = lambda x: _momentum(start, each, x * s)
@@ -157,10 +168,10 @@ def _rotation(p: Vectors, rates: Vectors, s: Array) -> tuple[Quaternions, Vector
     mean = jnp.tensordot(cast_to(_WEIGHTS, p), rates_at[:-1], 1)
     too_far = s**2 * jnp.max(turned, axis=0) > np.pi**2
 
-    def about(a: Array, b: Array, c: Array, w: Array) -> Array:
-        return s / 2 * jnp.where(is_small, (a + b) / 2 * w, c * mean)
+    def about(small: Array, c: Array) -> Array:
+        return jnp.where(is_small, small, s * c * mean) / 2
 
-    half = _each(about, start, end, middle, each)
+    half = _each(about, _small_angle(start, end, each, s), middle)
     angle = jnp.sqrt(_dot(half, half))
     turn = once((jnp.cos(angle), _each(lambda x: x * sinc(angle), half)))
 
@@ -200,9 +211,15 @@ def _rotation_jvp(primals, tangents):
     along = end * jnp.sum(work, axis=-1, keepdims=True)
     is_small = _is_small(p, rates, s)[..., None]
     square = jnp.where(is_small, 1, inner(p, p))
-    angle = s / 2 * rates * (p + end)
-    dangle = s * rates * (dp + dend) + (s * drates + ds * rates) * (p + end)
-    small = dangle / 2 - jnp.cross(angle, dangle) / 4
+
+    def small_angle(p: Vectors, end: Vectors, rates: Vectors, s: Array) -> Vectors:
+        start, later, each = map(_entries, (p, end, rates))
+        return jnp.stack(_small_angle(start, later, each, s), axis=-1)
+
+    at, changes = (p, end, rates, s), (dp, dend, drates, ds)
+    angle, dangle = jax.jvp(small_angle, at, changes)
+    turning = jnp.cross(angle, dangle)
+    small = dangle - turning / 2 + jnp.cross(angle, turning) / 6
     theta = (along + jnp.cross(end, change)) / square
     theta = once(jnp.where(is_small, small, theta))
     half = jnp.concatenate([jnp.zeros_like(theta[..., :1]), theta / 2], axis=-1)
