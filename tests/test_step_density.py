@@ -268,6 +268,13 @@ def test_a_density_that_cannot_be_followed_is_a_failure(solver):
     assert result(0.5, 1, 200) == result(0.5, 1, -200) == STEP_DENSITY_MISSED
     assert "Reduce `epsilon`" in dfx.RESULTS[STEP_DENSITY_MISSED]
     assert "`density`" in dfx.RESULTS[STEP_DENSITY_INVALID]
+    # A system without positions has no time scale.
+    spring = lambda t, q, args: jnp.sum(q**2) / 2
+    nothing = dps.MechanicalSystem(dps.QuadraticKinetic(), spring)
+    found = solve(
+        control(0.1, nothing), solver, 0.0, 1.0, (jnp.zeros(0), jnp.zeros(0)), nothing
+    )
+    assert found.result == STEP_DENSITY_INVALID
 
 
 def test_a_density_without_a_rate_at_the_start():

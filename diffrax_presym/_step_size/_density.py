@@ -10,6 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike
 
+from .. import _tree as tree
 from .._checks import as_positive, describe
 from .._numbers import as_time, cast_to, Scalar, State
 from .._results import STEP_DENSITY_INVALID, STEP_DENSITY_MISSED
@@ -202,7 +203,7 @@ class TimeScale(eqx.Module):
                 found.append(self._rate(args, found[-1]))
         powers = {k: fn(as_time(t), *y) for k, fn in enumerate(found, start=2)}
         # In units of the largest rate, so that nothing overflows.
-        rates = [jnp.max(jnp.abs(x)) ** (1 / k) for k, x in powers.items()]
+        rates = [tree.largest(x) ** (1 / k) for k, x in powers.items()]
         unit = lax.stop_gradient(functools.reduce(jnp.maximum, rates))
         unit = jnp.where(unit > 0, unit, 1)
         squares = {k: jnp.sum((x / unit**k) ** 2) for k, x in powers.items()}
