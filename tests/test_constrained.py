@@ -1,6 +1,7 @@
 """Constraints: orders and gradients with any friction, against SciPy on the equations
 with multipliers."""
 
+import itertools
 from functools import cache, partial
 from typing import Any
 
@@ -274,6 +275,29 @@ def test_an_initial_state_off_the_constraint(q, p, most, adjoint):
         diffeqsolve(sphere(), dps.Strang(), 0.0, 1.0, 0.1, y0, **options)
     y0 = sphere().project(0.0, y0)
     diffeqsolve(sphere(), dps.Strang(), 0.0, 1.0, 0.1, y0, **options)
+
+
+@pytest.mark.parametrize("adjoint", ["reversal", "Diffrax"])
+def test_an_initial_state_is_judged_without_a_unit_of_time(adjoint):
+    """Fast ones of molecules are right, as are those at rest but for rounding, and
+    slow ones that are not tangential are wrong."""
+
+    def run(held, q, p, duration):
+        y0, options = (jnp.array(q), p), {"adjoint": GRADIENTS[adjoint]}
+        options |= {"dt0": 0.1 * duration, "throw": False}
+        sol = diffeqsolve(held, dps.Strang(), 0.0, duration, y0=y0, args=p, **options)
+        return sol.result == dfx.RESULTS.successful
+
+    q, free = [0.6, 0.0, 0.8], lambda t, q, args: 0.0
+    body = dps.MechanicalSystem(dps.QuadraticKinetic(), free)
+    moving = dps.ConstrainedSystem(body, lambda t, q, p: q[:1] - 0.6 - p[1] * t)
+    for speed, off in itertools.product((1e13, 1.0, 1e-7), (0.0, 1e-6)):
+        p = speed * jnp.array([0.8 + off, 0.3, -0.6])
+        assert run(sphere(free), q, p, 1 / speed) == (off == 0)
+        p = speed * jnp.array([1.0 + off, 1.0])
+        assert run(moving, q[:2], p, 1 / speed) == (off == 0)
+    # By its weight, the last bits of a momentum are of no weight.
+    assert run(sphere(), q, 1e-16 * jnp.array(q), 1.0)
 
 
 @pytest.mark.parametrize(

@@ -217,6 +217,28 @@ def test_an_initial_state_off_the_manifold(case):
         diffeqsolve(system, dps.Strang(), 0.0, 1.0, 0.1, y0)
 
 
+@pytest.mark.parametrize("speed", [1e13, 1e-7])
+def test_an_initial_momentum_is_judged_by_its_size(speed):
+    system = dps.ManifoldSystem(dps.Sphere(), lambda t, q, args: 0.0 * q[0])
+    q, right = jnp.array([0.6, 0.0, 0.8]), speed * jnp.array([0.8, 0.3, -0.6])
+    for p in (right, right + 1e-6 * speed * q):
+        sol = diffeqsolve(
+            *(system, dps.Strang(), 0.0, 1 / speed, 0.1 / speed, (q, p)), throw=False
+        )
+        assert (sol.result == dfx.RESULTS.successful) == (p is right)
+
+
+def test_project_of_what_has_no_nearest_point():
+    """Columns of zero become some that are orthonormal to the others."""
+    frames = dps.ManifoldSystem(dps.Stiefel(), lambda t, q, args: q[0, 0])
+    y0 = jnp.diag(jnp.array([2.0, 0.0, 0.0]))[:, :2], jnp.ones((3, 2))
+    q, p = frames.project(0.0, y0)
+    np.testing.assert_allclose(q.T @ q, np.eye(2), atol=1e-15)
+    assert frames.violation(0.0, q, p) < 1e-15
+    ball = dps.ManifoldSystem(dps.Sphere(), lambda t, q, args: q[0])
+    assert jnp.isnan(ball.project(0.0, (jnp.zeros(3), jnp.ones(3)))[0]).all()
+
+
 @pytest.mark.parametrize(
     "solver",
     [dps.PresymplecticLeapfrog(), dps.TunedRKN6(), dps.PresymplecticGauss(2)],

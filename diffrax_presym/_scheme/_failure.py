@@ -52,7 +52,9 @@ def explain(
             found = failed & (lax.while_loop(more, lambda i: i + 1, first) < n)
         result = dfx.RESULTS.where(found, FRICTION_TOO_STRONG, result)
     result = dfx.RESULTS.where(result == NONFINITE, scheme.failure, result)
-    off = system.term.violation(ends[0][0], *tree.values(ends[0][1][0]), system.args)
+    t, point = ends[0]
+    y = tree.values(point[0])
+    off = system.term.off_manifold(t, span(first).h, *y, system.args)
     if off is not None:
         failure = SUCCESSFUL
         least = float(jnp.finfo(off.dtype).eps) ** 0.5

@@ -95,6 +95,13 @@ class AbstractSystem(dfx.AbstractTerm):
         the tangent space; `None`, the default, if there is no such manifold."""
         return None
 
+    def off_manifold(
+        self, t: Time, h: Time, q: Q, p: P, args: PyTree = None
+    ) -> Scalar | None:
+        """As `violation`, without a unit of time: of velocities relative to their size,
+        but for what moves a state by rounding in a step `h`."""
+        return self.violation(t, q, p, args)
+
     def project(self, t: Time, y: State, args: PyTree = None) -> State:
         """The state moved to the manifold of the system, and its momentum to the
         tangent space. By default, where there is none, `y`."""

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
+from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
 from .. import _tree as tree
@@ -20,6 +21,7 @@ from ._constrained_split import ConstrainedSplit
 from ._force_split import AbstractForceSplit
 from ._kinetic import QuadraticKinetic
 from ._manifold import ManifoldSystem
+from ._manifolds import size, unitless
 from ._mechanical import MechanicalSystem
 from ._multipliers import find_root, is_regular, LinearMap, Multipliers, solve
 from ._split import AbstractSplit
@@ -77,13 +79,14 @@ class ConstrainedSystem(AbstractSystem):
             `ManifoldSystem`, such as rigid bodies that are joined; with any friction
             and any forces of the velocity.
         - `constraint`: a function `g(t, q, args)` that returns an array, zero where the
-            constraints hold, or a scalar. A solve fails from a state where it, or its
-            rate of change, is not zero to 1e-8, so scale it, `q @ q / length**2 - 1`,
-            and take a unit of time in which velocities are not large or tiny.
+            constraints hold, or a scalar. A solve fails from a state where it is not
+            zero to 1e-8, so scale it, `q @ q / length**2 - 1`; or where its rate of
+            change is not, relative to that along other directions at the same speed.
         - `linear_solver`: a Lineax solver for the multipliers. Defaults to `None`, by
             their matrix. For a chain, in which constraints share coordinates with their
             neighbours alone, and neither mass nor friction joins others, the cost of
-            `lineax.Tridiagonal()` is linear.
+            `lineax.Tridiagonal()` is linear. Not for symmetric matrices alone, such as
+            `lineax.CG`, of which `lineax.Normal` makes one for any.
         - `check_inverse`: whether steps are also inverted, and fail if that ends
             elsewhere: for Monte Carlo methods. It doubles the cost. Defaults to
             `False`.
@@ -218,6 +221,21 @@ class ConstrainedSystem(AbstractSystem):
         much the state is off the manifold of the system."""
         t, other = as_time(t), self.system.violation(t, q, p, args)
         both = [self.value(t, q, args), self.rate(t, q, p, args)]
+        return tree.largest(both if other is None else [*both, other])
+
+    def off_manifold(self, t: Time, h: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
+        other = self.system.off_manifold(t, h, q, p, args)
+        rate, value = self.rate(t, q, p, args), lambda t, q: self.value(t, q, args)
+        # The size of a rate is that along other directions at the same speeds.
+        v = self.velocity(t, q, p, args)
+        speeds = lambda v: jnp.broadcast_to(size(jnp.atleast_1d(v)), v.shape or (1,))
+        speed, structure = ravel_pytree(jtu.tree_map(speeds, v))
+        angles = jnp.arange(1, 1 + speed.size).astype(speed.dtype)
+        other_way = structure(speed * jnp.cos(angles))
+        other_way = jtu.tree_map(lambda x, v: jnp.reshape(x, v.shape), other_way, v)
+        along = jnp.full_like(t, 2), other_way
+        here, usual = jax.jvp(value, (t, q), along)
+        both = [here, unitless(rate, usual, as_time(h))]
         return tree.largest(both if other is None else [*both, other])
 
     @eqx.filter_jit  # Outside of a solve, it would be compiled again by each call.

@@ -16,11 +16,11 @@ from .._forms import divide, multiply
 from .._friction._base import AbstractFriction, MASS, Mechanics
 from .._friction._damping import as_laws
 from .._friction._linear import LinearFriction
-from .._numbers import cast_to, Scalar, State, Time
+from .._numbers import as_time, cast_to, Scalar, State, Time
 from ._base import AbstractSystem, P, Q
 from ._bound import System
 from ._force_split import AbstractForceSplit
-from ._manifolds import AbstractManifold
+from ._manifolds import AbstractManifold, unitless
 from ._potential import AbstractPotential, as_potential, ForceField
 from ._split import AbstractSplit
 
@@ -146,10 +146,20 @@ class ManifoldSystem(AbstractSystem):
 
     def violation(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
         """By how much a state is off the manifold, or its momentum not tangential."""
-        return tree.largest(tree.sub(self.project(t, (q, p), args), (q, p)))
+        return tree.largest(self._miss(t, q, p))
+
+    def off_manifold(self, t: Time, h: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
+        place, momentum = self._miss(t, q, p)
+        # Where momenta are to be tangential they are velocities.
+        each = lambda miss, p: unitless(miss, tree.largest(p), as_time(h))
+        return tree.largest((place, jtu.tree_map(each, momentum, p)))
+
+    def _miss(self, t: Time, q: Q, p: P) -> State:
+        return tree.sub(self.project(t, (q, p)), (q, p))
 
     def project(self, t: Time, y: State, args: PyTree = None) -> State:
-        """A state on the manifold, from one near it, with a tangential momentum."""
+        """A state on the manifold, from one near it, with a tangential momentum; not a
+        number of a vector of length zero."""
         self.check_state(y)
         return self.pair(self._each("project", *y))
 

@@ -81,6 +81,13 @@ class Euclidean(AbstractManifold):
         return q, p
 
 
+def unitless(miss: Array, size: Array, h: Array) -> Array:
+    """A miss of velocities relative to their size; zero if over a step `h` it is that
+    of rounding, as of a body at rest."""
+    least = float(jnp.finfo(miss.dtype).eps) ** 0.75
+    return jnp.where(jnp.abs(h * miss) > least, miss / size, 0)
+
+
 # XLA on a CPU computes again for each use what it takes for cheap, but for a barrier.
 once = lax.optimization_barrier
 
@@ -162,5 +169,5 @@ class Stiefel(AbstractManifold):
 
     def project(self, q: Array, p: Array) -> Both:
         q, r = jnp.linalg.qr(q)
-        q = q * jnp.sign(jnp.diagonal(r))[None]
+        q = jnp.where(jnp.diagonal(r) < 0, -q, q)
         return q, self.pull(q, p)
