@@ -68,6 +68,10 @@ def _horner(terms: list[float], x: Numbers) -> Numbers:
 # omitted one is below the rounding of `float64`.
 _TERMS = 14
 _SQUARINGS = 16
+# On a CPU XLA makes one function of a loop, unless it multiplies matrices larger than
+# 3 x 3. Sums of products are 4 to 50 times faster for matrices of 4 to 12, and
+# 3 times slower for those of 16.
+_MOST_SUMMED = 12
 
 
 def exponentials(
@@ -99,7 +103,12 @@ def exponentials(
     numbers = np.arange(_TERMS, dtype=z.dtype)[None]
     ratios = jnp.expand_dims(fractions, 1) / (numbers + 1)
     terms = jnp.cumprod(jnp.where(numbers == 0, 1, ratios), axis=1)
-    combine = lambda c, x: jnp.tensordot(c, x, 1, precision="highest")
+
+    def combine(c, x):
+        if x.shape[-1] <= _MOST_SUMMED:
+            return jnp.sum(jnp.expand_dims(c, range(2, x.ndim + 1)) * x[None], axis=1)
+        return jnp.tensordot(c, x, 1, precision="highest")
+
     mean = combine(terms, powers[:-1])
     change = combine(fractions[:, None] * terms, powers[1:])
 
@@ -123,7 +132,16 @@ def _norm(matrix: Array) -> Array:
     return lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(matrix), axis=-2), initial=0))
 
 
+def exponential(matrix: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
+    if len(matrix) > _MOST_SUMMED:
+        return jax.scipy.linalg.expm(matrix)
+    change, _ = exponentials(-matrix, jnp.ones(1, matrix.dtype))
+    return jnp.eye(len(matrix), dtype=matrix.dtype) + change[0]
+
+
 def _product(x: Array, y: Array) -> Array:
+    if x.shape[-1] <= _MOST_SUMMED:
+        return jnp.sum(x[..., None] * jnp.expand_dims(y, -3), axis=-2)
     return jnp.matmul(x, y, precision="highest")
 
 

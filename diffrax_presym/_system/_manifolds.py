@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Inexact
 
 from .._checks import as_positive
+from .._friction._exponential import exponential
 from .._numbers import cast_to
 
 
@@ -144,7 +145,7 @@ class Stiefel(AbstractManifold):
         return q if len(q) == 2 and q[0] >= q[1] else None
 
     def flow(self, q: Array, p: Array, s: Array) -> Both:
-        expm, a, k = jax.scipy.linalg.expm, q.T @ p, q.shape[1]
+        expm, a, k = exponential, q.T @ p, q.shape[1]
         a = (a - a.T) / 2
         if q.shape[0] == k:
             q = q @ expm(s * a)
