@@ -1,5 +1,7 @@
 """Linear maps in the forms that users write: masses, stiffnesses, friction."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.lax as lax
@@ -187,6 +189,24 @@ def divide(form, x: PyTree, name: str, state: str, symmetric=True) -> PyTree:
         return jnp.vectorize(solve_positive, signature="(n,n),(n)->(n)")(form, x)
 
     return jtu.tree_map(leaf, x, fit_form(form, x, name, state, symmetric))
+
+
+def inverse(form, x: PyTree, name: str, state: str) -> PyTree:
+    """The form of the inverse map, to `multiply` by; `None` if no part of it is a
+    matrix, or if it is an operator."""
+    if form is None or is_operator(form):
+        return None
+    form = fit_form(form, x, name, state)
+    if not any(jtu.tree_leaves(jtu.tree_map(is_matrix, form, x))):
+        return None
+
+    @partial(jnp.vectorize, signature="(n,n)->(n,n)")
+    def inverted(M: Matrix) -> Matrix:
+        columns = jax.vmap(partial(solve_positive, M))(jnp.eye(len(M), dtype=M.dtype))
+        return (columns + columns.T) / 2
+
+    leaf = lambda form, x: inverted(form) if is_matrix(form, x) else 1 / form
+    return jtu.tree_map(leaf, form, x)
 
 
 # The fastest factorisation depends on the size: written out in full, which for more

@@ -80,8 +80,36 @@ def test_masses(mass, p, expected):
     velocity = kinetic.velocity(T, p)
     assert jtu.tree_structure(velocity) == jtu.tree_structure(p)
     assert_close(velocity, jtu.tree_map(jnp.asarray, expected), 1e-15)
+    assert_close(kinetic.factorised(p).velocity(T, p), velocity, 1e-15)
     assert_close(kinetic(T, p), flat(p) @ flat(expected) / 2, 1e-15)
     assert_close(velocity, jax.grad(kinetic, 1)(T, p), 1e-14)
+
+
+@pytest.mark.parametrize("constrained", [False, True])
+@pytest.mark.parametrize("n", [3, 10, 20])
+def test_a_matrix_is_factorised_once(n, constrained):
+    x = np.random.default_rng(0).normal(size=(n, n))
+    M, q = jnp.asarray(np.eye(n) + 0.1 * x @ x.T / n), jnp.linspace(0.5, 1.0, n)
+
+    def end(M, adjoint=None):
+        kinetic, drag = dps.QuadraticKinetic(M), dps.ViscousDamping(0.1)
+        system: Any = dps.MechanicalSystem(kinetic, harmonic, drag)
+        if constrained:
+            system = dps.ConstrainedSystem(system, lambda t, q, args: q[:2] - 0.5)
+        y0 = system.project(0.0, (q.at[:2].set(0.5), 1 - q))
+        solver = dps.Strang() if constrained else dps.TunedRKN6()
+        adjoint = adjoint or dps.FixedStepAdjoint()
+        sol = solve(system, solver, 0.0, 1.0, 0.1, y0, adjoint=adjoint)
+        return jax.tree.map(lambda x: x[-1], sol.ys)
+
+    assert_close(end(M), end(M, dfx.RecursiveCheckpointAdjoint()), 1e-13)
+    slope = jax.grad(lambda M: jnp.sum(end(M)[0] ** 2))(M)
+    change = jnp.asarray(x + x.T)
+    near = [jnp.sum(end(M + s * change)[0] ** 2) for s in (1e-5, -1e-5)]
+    assert_close(jnp.sum(slope * change), (near[0] - near[1]) / 2e-5, 1e-8)
+    for equation in jax.make_jaxpr(end)(M).eqns:
+        if equation.primitive.name == "while" and not constrained:
+            assert "custom_linear_solve" not in str(equation)
 
 
 SPRINGS: dict[str, tuple[Any, Any]] = {

@@ -114,7 +114,7 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         y, carry, made_jump, meter, control = private.start_of(init_state)
         # Of friction at a place it has the user's objects, whose fields may be numbers.
         carry = jtu.tree_map(jnp.asarray, carry)
-        system = bind(terms, args, y)
+        system = bind(terms, args, y).factorised(y)
         unsupported = event, saveat, passed_controller_state
         _check(solver, stepsize_controller, *unsupported)
         scheme = solver.scheme(system)

@@ -107,6 +107,11 @@ class AbstractSystem(dfx.AbstractTerm):
         tangent space. By default, where there is none, `y`."""
         return y
 
+    def factorised(self, p: P) -> "AbstractSystem":
+        """The same system, for many evaluations with momenta of this shape. By default
+        nothing can be computed beforehand."""
+        return self
+
     def is_valid(
         self, t: Time, q: Q, p: P, args: PyTree = None
     ) -> Bool[Array, ""] | None:

@@ -131,6 +131,9 @@ class ConstrainedSystem(AbstractSystem):
     def fit_friction(self, p: P) -> LinearFriction | None:
         return self.system.fit_friction(p)
 
+    def factorised(self, p: P) -> "ConstrainedSystem":
+        return eqx.tree_at(lambda x: x.system, self, self.system.factorised(p))
+
     def check_state(self, y: PyTree) -> None:
         self.system.check_state(y)
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
 from .. import _tree as tree
 from .._checks import as_positive, check_callable, scalar_fn
-from .._forms import as_mass, divide, is_symmetric, multiply
+from .._forms import as_mass, divide, inverse, is_symmetric, multiply
 from .._friction._base import MASS
 from .._friction._exponential import gauss_legendre
 from .._friction._linear import LinearFriction
@@ -97,6 +97,7 @@ class QuadraticKinetic(AbstractKinetic):
 
     mass: PyTree[Inexact[Array, "..."]] | lx.AbstractLinearOperator | None
     symmetric: bool = eqx.field(static=True)
+    inverse: PyTree[Inexact[Array, "..."]] | None  # of a mass with a matrix, if known
 
     def __init__(self, mass=None):
         """**Arguments:**
@@ -126,7 +127,7 @@ class QuadraticKinetic(AbstractKinetic):
         operators other than `lineax.MatrixLinearOperator`.
         """
         self.mass = as_mass(mass, MASS, _OF_POSITIONS)
-        self.symmetric = is_symmetric(mass)
+        self.symmetric, self.inverse = is_symmetric(mass), None
 
     is_quadratic: ClassVar[bool] = True
     is_autonomous: ClassVar[bool] = True
@@ -136,7 +137,16 @@ class QuadraticKinetic(AbstractKinetic):
         return energy / 2
 
     def velocity(self, t: Time, p: PyTree, args: PyTree = None) -> PyTree:
+        if self.inverse is not None:
+            return multiply(self.inverse, p, MASS, "p")
         return divide(self.mass, p, MASS, "p", self.symmetric)
+
+    def factorised(self, p: PyTree) -> "QuadraticKinetic":
+        """The same, with the inverse of the mass if that has a matrix."""
+        known = inverse(self.mass, p, MASS, "p")
+        return eqx.tree_at(
+            lambda x: x.inverse, self, known, is_leaf=lambda x: x is None
+        )
 
     def momentum(self, v: PyTree) -> PyTree:
         """The momentum `M v` of a velocity."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 from jaxtyping import PyTree
 
@@ -105,6 +106,11 @@ class MechanicalSystem(AbstractSystem):
         if isinstance(self.kinetic, QuadraticKinetic):
             return Mechanics(self.kinetic.mass)
         return Mechanics(mass_varies=True)
+
+    def factorised(self, p: P) -> "MechanicalSystem":
+        if not isinstance(self.kinetic, QuadraticKinetic):
+            return self
+        return eqx.tree_at(lambda x: x.kinetic, self, self.kinetic.factorised(p))
 
     # The vector field.
 
