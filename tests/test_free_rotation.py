@@ -7,6 +7,7 @@ import pytest
 import scipy.integrate
 
 import diffrax_presym as dps
+from diffrax_presym._system._free_rotation import multiply
 
 
 UNIT = np.array([1.0, -0.2, 0.5, 0.3]) / np.linalg.norm([1.0, -0.2, 0.5, 0.3])
@@ -131,6 +132,43 @@ def test_long_steps_are_right_or_fail(body):
             np.testing.assert_allclose(found, euler(inertia, p, s), atol=1e-8)
     assert failed == sorted(failed) and not failed[0]
     assert failed[-1] or body == "asymmetric"
+
+
+@pytest.mark.parametrize("inertia", [[1.0, 1.2, 0.4], [5.0, 1.0, 0.01]])
+def test_a_spin_about_the_middle_axis(inertia):
+    """Where the functions grow or vanish exponentially, and the momentum is at rest."""
+    inertia, failed = np.array(inertia), []
+    unit = np.eye(3)[np.argsort(inertia)[1]]
+    for angle in 0.5, 1.0, 3.0, 10.0, 20.0, 50.0:
+        found = flow(inertia, state(inertia * unit), angle)
+        failed.append(bool(np.isnan(found[0])))
+        if not failed[-1]:
+            half = np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * unit])
+            turned = multiply(jnp.asarray(UNIT), jnp.asarray(half))
+            wanted = np.concatenate([turned, inertia * unit])
+            np.testing.assert_allclose(found, wanted, atol=1e-13)
+    assert failed == sorted(failed) and not failed[1]
+
+
+def test_steps_in_which_a_body_turns_many_times():
+    """Of bodies that may be, half of them near the middle axis: right, or failed in
+    both directions."""
+    rng, passed, errors = np.random.default_rng(0), 0, []
+    for k in range(60):
+        sizes = rng.uniform(0.02, 1.0, 3)
+        inertia = np.sum(sizes) - sizes
+        p = rng.standard_normal(3)
+        if k % 2:
+            p *= np.where(np.arange(3) == np.argsort(inertia)[1], 1.0, 1e-2)
+        s = rng.uniform(0.2, 20.0) / np.linalg.norm(p / inertia)
+        found = flow(inertia, state(p), s)
+        if not np.isnan(found).any():
+            exact = euler(inertia, p, s)
+            errors.append(np.max(np.abs(found[:4] - exact[:4])))
+            np.testing.assert_allclose(found[4:], exact[4:], atol=1e-9)
+            np.testing.assert_allclose(flow(inertia, found, -s), state(p), atol=1e-6)
+            passed += 1
+    assert passed > 30 and np.max(errors) < 1e-6 and np.median(errors) < 1e-11
 
 
 @pytest.mark.parametrize("s", [10.0, 40.0])
