@@ -117,8 +117,14 @@ def dot(x: PyTree, y: PyTree) -> Array:
 
 
 def largest(x: PyTree) -> Array:
-    """The largest absolute value of all entries."""
-    sizes = jtu.tree_map(lambda x: jnp.max(jnp.abs(x), initial=0), x)
+    """The largest absolute value of all entries, NaN if one of them is."""
+
+    def leaf(x):
+        # XLA on a CPU drops NaN from the maxima of a thousand rows.
+        bad = jnp.any(jnp.isnan(x))
+        return jnp.where(bad, jnp.nan, jnp.max(jnp.abs(x), initial=0))
+
+    sizes = jtu.tree_map(leaf, x)
     with jax.numpy_dtype_promotion("standard"):
         return jtu.tree_reduce(jnp.maximum, sizes)
 

@@ -1,6 +1,7 @@
 """Rigid bodies, spheres and orthonormal matrices: beside SciPy on the equations in
 rotation matrices or with multipliers, and beside closed forms."""
 
+from functools import partial
 from typing import Any
 
 import diffrax as dfx
@@ -226,6 +227,17 @@ def test_an_initial_momentum_is_judged_by_its_size(speed):
             *(system, dps.Strang(), 0.0, 1 / speed, 0.1 / speed, (q, p)), throw=False
         )
         assert (sol.result == dfx.RESULTS.successful) == (p is right)
+
+
+def test_a_batch_of_failed_states_is_off_the_manifold():
+    """XLA on a CPU drops NaN from the maxima of a thousand rows."""
+    ball = dps.ManifoldSystem(dps.Sphere(), lambda t, q, args: q[0])
+    rod = dps.MechanicalSystem(dps.QuadraticKinetic(), lambda t, q, args: q[0])
+    held = dps.ConstrainedSystem(rod, lambda t, q, args: q @ q - 1)
+    lost = jnp.full((2048, 3), jnp.nan)
+    for system in ball, held:
+        off = jax.jit(jax.vmap(partial(system.violation, 0.0)))(lost, lost)
+        assert jnp.isnan(off).all()
 
 
 def test_project_of_what_has_no_nearest_point():
