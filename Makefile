@@ -49,7 +49,7 @@ test: $(VENV)/.with-tests  ## Run the tests, except the slow ones
 slow: $(VENV)/.with-tests  ## Run the slow tests
 	@$(BIN)/python $(PYTEST) -m slow $(if $(PART),--part $(PART))
 
-# Each of fifty errors is made in a copy of the package, which takes hours.
+# Each of many errors is made in a copy of the package, which takes hours.
 # `make mutants ONLY="loop friction"` takes those with one of these words in their name.
 mutants: $(VENV)/.with-tests  ## Count the deliberate errors that the tests find
 	@$(BIN)/python tests/mutants.py $(ONLY)

@@ -3,9 +3,9 @@
 Six systems whose friction is not one rate for all momenta, with the solvers of this
 package and those of Diffrax, adaptive and with constant steps. `best ours / theirs` are
 ratios of the least of any solver, by time and by evaluations; `schemes` are those that
-reach it. A dash is an error that none of the runs reached. A further table is the time
+reach it. A dash is an error that none of the runs reached. Further tables are the time
 of solves with matrix friction of 50 unknowns, that save at 401 times: few long steps
-over many short ones.
+over many short ones; and the cost of friction, and of compensated sums, in a step.
 """
 
 import math
@@ -241,6 +241,27 @@ def many_times(quick):
         table.row(name, *cells, found[80].over(found[400]))
 
 
+STEPS = 200
+
+
+def of_steps(variants, y0, quick):
+    """Timings of solves of `STEPS` steps: of systems and solvers."""
+    calls = {}
+    for key, (system, solver) in variants.items():
+        solve = partial(
+            *(dfx.diffeqsolve, system, solver, 0.0, 20.0, 20.0 / STEPS),
+            adjoint=dps.FixedStepAdjoint(),
+            max_steps=None,
+        )
+        run = jax.jit(lambda y0, solve=solve: solve(y0).ys)
+        calls[key] = partial(run, y0)
+    return interleaved(calls, 5 if quick else 101)
+
+
+def pendulum(law):
+    return mechanics(lambda t, q, args: -jnp.sum(jnp.cos(q)), law)
+
+
 def of_time(quick):
     """The time of a step with friction that depends on time, over that with a constant
     rate, of one pendulum."""
@@ -250,19 +271,12 @@ def of_time(quick):
         "two laws": [dps.LogDamping(1.0, shift=10.0), dps.PowerDamping(0.1, 0.5)],
     }
     solvers = "PresymplecticLeapfrog", "BlanesMoanRKN4", "TunedRKN6", "BlanesMoan6"
-    y0, steps, calls = (jnp.ones(1), jnp.zeros(1)), 200, {}
-    for name in solvers:
-        for kind, law in laws.items():
-            system = mechanics(lambda t, q, args: -jnp.sum(jnp.cos(q)), law)
-            solve = partial(
-                dfx.diffeqsolve,
-                *(system, SCHEMES[name].solver, 0.0, 20.0, 20.0 / steps),
-                adjoint=dps.FixedStepAdjoint(),
-                max_steps=None,
-            )
-            run = jax.jit(lambda y0, solve=solve: solve(y0).ys)
-            calls[name, kind] = partial(run, y0)
-    found = interleaved(calls, 5 if quick else 101)
+    variants = {
+        (name, kind): (pendulum(law), SCHEMES[name].solver)
+        for name in solvers
+        for kind, law in laws.items()
+    }
+    found = of_steps(variants, (jnp.ones(1), jnp.zeros(1)), quick)
     table = Table(
         "Friction that depends on time: a step over one with a constant rate",
         *("scheme:<24", "constant, ns:>12.0f", "a function:>11.1f", "two laws:>9.1f"),
@@ -270,7 +284,30 @@ def of_time(quick):
     for name in solvers:
         constant, *more = (found[name, kind] for kind in laws)
         ratios = (timing.over(constant) for timing in more)
-        table.row(name, 1e9 * constant.median / steps, *ratios)
+        table.row(name, 1e9 * constant.median / STEPS, *ratios)
+
+
+def costs(quick):
+    """The time of a step with friction, or with compensated sums, over that without, of
+    pendulums."""
+    table = Table(
+        "Pendulums: a step over one without friction",
+        *("unknowns:>8", "scheme:<22", "without, ns:>11.0f", "constant:>8.2f"),
+        *("3 / (t + 1):>11.2f", "Compensated:>11.2f"),
+    )
+    for n in (1, 100) if quick else (1, 100, 1000):
+        for name in ("PresymplecticLeapfrog", "BlanesMoanRKN4"):
+            solver: Any = SCHEMES[name].solver
+            variants = {
+                "without": (pendulum(None), solver),
+                "constant": (pendulum(dps.ConstantDamping(0.1)), solver),
+                "of time": (pendulum(dps.LogDamping(3.0, shift=1.0)), solver),
+                "Compensated": (pendulum(None), dps.Compensated(solver)),
+            }
+            found = of_steps(variants, (jnp.ones(n), jnp.zeros(n)), quick)
+            without, *more = found.values()
+            ratios = (timing.over(without) for timing in more)
+            table.row(str(n), name, 1e9 * without.median / STEPS, *ratios)
 
 
 def main():
@@ -288,6 +325,7 @@ def main():
     if not options.only:
         many_times(options.quick)
         of_time(options.quick)
+        costs(options.quick)
 
 
 if __name__ == "__main__":

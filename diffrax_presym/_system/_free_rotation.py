@@ -34,8 +34,8 @@ _DOUBLINGS = 6
 _NODES, _WEIGHTS = (x / 2 for x in np.polynomial.legendre.leggauss(7))
 _TIMES = np.append(0.5 + _NODES, 1.0)
 # The interpolant through the nodes, at the end, and by how much of an angle the rate at
-# an end may differ from it over the step. The error of the quadrature, of twice the
-# order, is then at most 3e-7.
+# an end may differ from it over the step. The quadrature has twice the order: its error
+# is then about 1e-9, at most 4e-6 in 6e4 random steps.
 _AT_END = np.array(
     [np.prod([(0.5 - y) / (x - y) for y in _NODES if y != x]) for x in _NODES]
 )

@@ -170,5 +170,5 @@ class Stiefel(AbstractManifold):
 
     def project(self, q: Array, p: Array) -> Both:
         q, r = jnp.linalg.qr(q)
-        q = jnp.where(jnp.diagonal(r) < 0, -q, q)
+        q = jnp.where(jnp.diagonal(r)[None] < 0, -q, q)
         return q, self.pull(q, p)
