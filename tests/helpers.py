@@ -104,3 +104,15 @@ def assert_close(x, y, tolerance):
     assert np.all(np.isfinite(x)) and np.all(np.isfinite(y))
     size = np.max(np.abs(y), initial=1)
     assert np.max(np.abs(x - y), initial=0) <= tolerance * size
+
+
+def equations(jaxpr):
+    """All of a program, also of its parts."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for part in jtu.tree_leaves(
+            equation.params, is_leaf=lambda x: hasattr(x, "eqns")
+        ):
+            part = getattr(part, "jaxpr", part)
+            if hasattr(part, "eqns"):
+                yield from equations(part)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+from helpers import equations
 
 import diffrax_presym as dps
 from diffrax_presym._results import FRICTION_TOO_STRONG
@@ -235,15 +236,9 @@ def test_second_derivatives():
 
 def _selected(jaxpr):
     """The shapes of what is selected anywhere in a program."""
-    for equation in jaxpr.eqns:
+    for equation in equations(jaxpr):
         if equation.primitive.name == "select_n":
             yield from (x.aval.shape for x in equation.outvars)
-        for part in jax.tree.leaves(
-            equation.params, is_leaf=lambda x: hasattr(x, "eqns")
-        ):
-            part = getattr(part, "jaxpr", part)
-            if hasattr(part, "eqns"):
-                yield from _selected(part)
 
 
 QUARTIC = dps.MechanicalSystem(
