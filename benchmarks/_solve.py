@@ -51,7 +51,7 @@ def states(
     **options,
 ) -> Any:
     """What is saved in `x` equal steps, or in adaptive ones with tolerance `x`: by
-    default the final state; if they `count`, also how many steps it took, and whether
+    default the final state; if they `count`, also how many steps it took, and how many
     values between these are interpolated.
 
     Solvers of this package run in the loop of `FixedStepAdjoint`. With a step density
@@ -75,7 +75,7 @@ def states(
     ys = jax.tree.map(lambda y: jnp.where(good, y, jnp.nan), ys)
     if not count:
         return ys
-    return ys, sol.stats["num_steps"], sol.stats.get("interpolated", False)
+    return ys, sol.stats["num_steps"], sol.stats.get("interpolated", 0)
 
 
 def relative_error(y, exact):

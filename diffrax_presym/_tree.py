@@ -7,7 +7,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, ArrayLike, Bool, PyTree
+from jaxtyping import Array, ArrayLike, Bool, PyTree, Shaped
 
 from ._numbers import cast_to
 
@@ -80,14 +80,19 @@ def scale(c: ArrayLike, y: PyTree) -> PyTree:
 
 
 @jax.custom_batching.custom_vmap
-def any_member(x: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Whether it is true for any member of a batch, the same for all of them."""
+def largest_member(x: Shaped[Array, ""]) -> Shaped[Array, ""]:
+    """The largest among the members of a batch, the same for all of them."""
     return x
 
 
-@any_member.def_vmap
+@largest_member.def_vmap
 def _(axis_size, in_batched, x):
-    return any_member(jnp.any(x, axis=0)), False
+    return largest_member(jnp.max(x, axis=0)), False
+
+
+def any_member(x: Bool[Array, ""]) -> Bool[Array, ""]:
+    """Whether it is true for any member of a batch, the same for all of them."""
+    return largest_member(x)
 
 
 def invalid_if(bad: Bool[Array, ""], y: PyTree) -> PyTree:

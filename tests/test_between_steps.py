@@ -131,7 +131,7 @@ def test_never_across_a_kink():
 @pytest.mark.parametrize("gamma", [0.4, 4.0, 400.0])
 def test_strong_friction_takes_shorter_steps(gamma):
     sol = solve(RKN4, 40, gamma=gamma)
-    assert sol.stats["interpolated"] == (gamma == 0.4)
+    assert bool(sol.stats["interpolated"]) == (gamma == 0.4)
     if gamma == 400.0:
         assert sol.result == FRICTION_TOO_STRONG
         return
@@ -214,7 +214,7 @@ def test_members_of_a_batch_are_those_alone():
 
     run = jax.value_and_grad(loss, has_aux=True)
     (_, (ys, interpolated)), got = jax.jit(jax.vmap(run, (0, None)))(gammas, Y0)
-    assert interpolated.tolist() == [True, False, True]
+    assert (interpolated > 0).tolist() == [True, False, True]
     for i, gamma in enumerate(gammas):
         (_, (alone, _)), gradient = jax.jit(run)(gamma, Y0)
         member = np.stack([y[i] for y in ys])

@@ -113,3 +113,102 @@ def test_a_speed_has_no_derivative_at_rest(solver):
     total = lambda c: jnp.sum(saved(c)[1])
     difference = (total(0.5 + 1e-5) - total(0.5 - 1e-5)) / 2e-5
     assert jax.grad(total)(0.5) == pytest.approx(float(difference), rel=1e-7)
+
+
+DECAYING = {
+    "3 / (t + 1)": (dps.LogDamping(3.0, 1.0), lambda t: 3 / (t + 1)),
+    "3 / t": (dps.LogDamping(3.0), lambda t: 3 / t if t > 0 else 0.0),
+    # A function of time, strong at first and once more.
+    "pulse": (
+        lambda t: 2 * jnp.tanh(2 * (t - 3)) + 4 * jnp.tanh(t),
+        lambda t: 4 / np.cosh(2 * (t - 3)) ** 2 + 4 / np.cosh(t) ** 2,
+    ),
+}
+
+
+def anharmonic(law, solver, ts, n, y0=1.0) -> Any:
+    """An oscillator whose friction is strong for some steps."""
+    well = lambda t, q, args: jnp.sum(q**2 / 2 + q**4 / 8)
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), well, law)
+    return dfx.diffeqsolve(
+        *(system, solver, 0.0, 24.0, 24.0 / n, (y0 * jnp.ones(1), jnp.zeros(1))),
+        saveat=dfx.SaveAt(ts=jnp.asarray(ts)),
+        adjoint=dps.FixedStepAdjoint(),
+        max_steps=None,
+    )
+
+
+@pytest.mark.parametrize("name", DECAYING)
+@pytest.mark.parametrize("solver", [dps.BlanesMoanRKN4(), dps.BlanesMoan6()])
+def test_friction_that_ceases_takes_shorter_steps_until_then(name, solver):
+    ts, (law, rate) = np.linspace(0.0, 24.0, 241), DECAYING[name]
+    slope = lambda t, y: [y[1], -y[0] - y[0] ** 3 / 2 - rate(t) * y[1]]
+    if name == "3 / t":  # which starts as q = 1 - q'' t^2 / 2, with 4 q'' = 1.5
+        slope = lambda t, y: (
+            [y[1], -y[0] - y[0] ** 3 / 2 - 3 * y[1] / t] if t else [0, -0.375]
+        )
+    options: dict[str, Any] = {"rtol": 1e-12, "atol": 1e-13, "max_step": 0.05}
+    right = scipy.integrate.solve_ivp(
+        *(slope, (0.0, 24.0), [1.0, 0.0], "DOP853", ts), **options
+    ).y
+    sol = anharmonic(law, solver, ts, 60)
+    assert 180 < int(sol.stats["interpolated"]) < 230
+    error = np.abs(np.stack([x[:, 0] for x in sol.ys]) - right)
+    assert np.max(error) < 3 * np.max(error[:, ::4]) < 3e-3
+
+
+@pytest.mark.parametrize("solver", [dps.BlanesMoanRKN4(), GAUSS(2)])
+def test_gradients_where_some_values_are_shorter_steps(solver):
+    """Alone, and in a batch of which one member takes none, and one no other."""
+    ts = jnp.linspace(0.1, 23.9, 77).at[jnp.array([3, 40])].set(jnp.nan)
+
+    def total(x):
+        rate, shift, y0 = x
+        sol = anharmonic(dps.LogDamping(rate, shift), solver, ts, 60, y0=y0)
+        ys = jnp.concatenate(sol.ys, axis=1)
+        weights = jnp.cos(jnp.arange(ys.size, dtype=float)).reshape(ys.shape)
+        loss = jnp.sum(jnp.where(jnp.isfinite(ys), ys, 0.0) * weights)
+        return loss, (ys, sol.stats["interpolated"])
+
+    run, value = jax.value_and_grad(total, has_aux=True), jax.jit(total)
+    members = jnp.array([[3.0, 1.0, 1.0], [0.5, 1.0, 0.8], [600.0, 200.0, 1.2]])
+    (_, (ys, number)), gradients = jax.jit(jax.vmap(run))(members)
+    assert number[1] == 75 and 0 < number[0] < 75 and number[2] == 0
+    for x, y, gradient in zip(members, ys, gradients, strict=True):
+        (_, (alone, _)), got = jax.jit(run)(x)
+        np.testing.assert_allclose(y, alone, 1e-12, 1e-13)
+        np.testing.assert_allclose(gradient, got, 1e-9, 1e-11)
+        for e in 1e-6 * jnp.eye(3):
+            two = (value(x + e)[0] - value(x - e)[0]) / 2e-6
+            assert got @ e / 1e-6 == pytest.approx(float(two), rel=1e-5, abs=1e-7)
+
+
+def test_a_batch_of_which_one_starts_where_friction_is_singular():
+    def total(shift):
+        law = dps.LogDamping(2.0, shift)
+        sol = anharmonic(law, dps.BlanesMoanRKN4(), jnp.linspace(0, 24, 50), 60)
+        return jnp.sum(sol.ys[0] ** 2)
+
+    both = jax.vmap(jax.value_and_grad(total))(jnp.array([0.0, 30.0]))
+    for i, shift in enumerate((0.0, 30.0)):
+        value, slope = jax.value_and_grad(total)(shift)
+        assert both[0][i] == pytest.approx(float(value), rel=1e-12)
+        assert np.isfinite(value) and (i == 0 or np.isfinite(slope))
+        np.testing.assert_allclose(both[1][i], slope, 1e-9)
+
+
+def test_backwards_to_strong_friction_takes_shorter_steps():
+    """Which are at the end of the solve, so that all before take them too."""
+    ts, law = jnp.linspace(24.0, 0.0, 241), dps.LogDamping(3.0, 1.0)
+    there = anharmonic(law, dps.BlanesMoanRKN6(), ts[::-1], 120)
+    y0 = [x[-1] for x in there.ys]
+    well = lambda t, q, args: jnp.sum(q**2 / 2 + q**4 / 8)
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), well, law)
+    back: Any = dfx.diffeqsolve(
+        *(system, dps.BlanesMoanRKN6(), 24.0, 0.0, -0.2, tuple(y0)),
+        saveat=dfx.SaveAt(ts=ts),
+        adjoint=dps.FixedStepAdjoint(),
+    )
+    assert int(back.stats["interpolated"]) == 0
+    for x, y in zip(there.ys, back.ys, strict=True):
+        np.testing.assert_allclose(x[::-1], y, 0, 1e-5)

@@ -140,7 +140,10 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
             reversal=isinstance(way, Reversal),
         )
         final = _final_state(problem, way, init_state, structure)
-        about = {"order": solver.order(terms), "interpolated": problem.interpolates}
+        about = {
+            "order": solver.order(terms),
+            "interpolated": problem.number_interpolated,
+        }
         return final, about
 
     def _way(

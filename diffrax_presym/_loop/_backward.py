@@ -201,9 +201,7 @@ class PullRows(AbstractPull):
         problem, i = backward.problem, self.i
         number = jnp.sum(problem.rows[i].reached(backward.trace.n))
         stencils = problem.stencils[i]
-        return (
-            number if stencils is None else jnp.where(stencils.ways.others, number, 0)
-        )
+        return number if stencils is None else jnp.minimum(number, stencils.latest)
 
     def due(self, state, n):
         stop = self.stops[state - 1]
@@ -214,7 +212,7 @@ class PullRows(AbstractPull):
         rows = problem.rows[i]
         taken = rows.stop[j] >= 0
         if (stencils := problem.stencils[i]) is not None:
-            taken &= ~stencils.ways.interpolated
+            taken &= j < stencils.begin
         bar = backward.row(i, int(problem.subs[i].t0) + j, taken)
 
         def pull(shorter: bool):
@@ -244,7 +242,8 @@ class PullNodes(AbstractPull):
     def due(self, state, n):
         node, low, j, _ = state
         last = self.stencils.last[j - 1]
-        row = jnp.where(j > 0, jnp.where(last < 0, n, last), -1)
+        row = jnp.where(last < 0, n, last)
+        row = jnp.where(j > self.stencils.earliest, row, -1)
         return jnp.where(node > low, node - 1, row)
 
     def pull(self, backward, at, state):
@@ -254,7 +253,7 @@ class PullNodes(AbstractPull):
         def spread(x):
             gradient, low, j, bars = x
             j = j - 1
-            taken = (rows.stop[j] >= 0) & self.stencils.ways.interpolated
+            taken = (rows.stop[j] >= 0) & (j >= self.stencils.begin)
             _, bar = backward.row(i, int(problem.subs[i].t0) + j, taken)
             # Of the others nothing may fail of which a gradient takes zero times.
             time = jnp.where(taken, rows.time[j], problem.steps.t0)
@@ -268,10 +267,11 @@ class PullNodes(AbstractPull):
 
         def unspread(x):
             last = self.stencils.last[x[2] - 1]
-            return (x[2] > 0) & ((last < 0) | (last >= n))
+            return (x[2] > self.stencils.earliest) & ((last < 0) | (last >= n))
 
         def pull(side: Array, at: BackwardState, bars: PyTree):
-            node = lambda functions, point: functions.node(n, side, point)
+            m = jnp.maximum(n, self.stencils.first_node)
+            node = lambda functions, point: functions.node(m, side, point)
             bar = jtu.tree_map(lambda x: x[n % NODES], bars)
             at = at.add(*backward.pull(node, bar, at.point))
             return at, put(bars, n % NODES, _zeros(bar))

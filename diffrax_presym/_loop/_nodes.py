@@ -17,6 +17,7 @@ from .. import _tree as tree
 from .._numbers import cast_to, State
 from .._scheme._base import Point, Scheme
 from .._system._bound import System
+from ._base import MOST_STEPS
 from ._rows import Rows
 from ._steps import Steps
 
@@ -83,29 +84,19 @@ def _rate(system: System, t: Array, y: State, h: Array) -> Float[Array, ""]:
     return jnp.abs(lax.fori_loop(0, _ITERATIONS, iterate, start)[1])
 
 
-class Ways(eqx.Module):
-    """Whether values between steps are interpolated, or are shorter steps."""
-
-    interpolated: Bool[Array, ""]
-    # Whether they are so in any member of a batch, the same for all of them.
-    some: Bool[Array, ""]
-    others: Bool[Array, ""]  # whether any are not
-
-    def __init__(self, system: System, steps: Steps, last: Array, y: State):
-        yes = jnp.minimum(steps.fewest, last) >= NODES - 1
-        yes &= steps.ratio <= _MOST_RATIO
-        if system.friction is not None:
-            most = lax.stop_gradient(steps.largest_friction(system, last))
-            yes &= most <= _MOST_FRICTION
-        if system.has_unknown_friction:
-            h = steps.longest
-            most = jnp.abs(h) * _rate(system, system.time(steps.t0), y, h) / 2
-            yes &= lax.stop_gradient(most) <= _MOST_FRICTION
-        self.interpolated, self.some, self.others = (
-            yes,
-            tree.any_member(yes),
-            tree.any_member(~yes),
-        )
+def first_node(system: System, steps: Steps, last: Array, y: State) -> Int[Array, ""]:
+    """The step from whose start on values between steps are interpolated; before it
+    they are shorter steps."""
+    yes = jnp.minimum(steps.fewest, last) >= NODES - 1
+    yes &= steps.ratio <= _MOST_RATIO
+    first = jnp.zeros((), int)
+    if system.friction is not None:
+        first = steps.weak_from(system, last, _MOST_FRICTION)
+    if system.has_unknown_friction:
+        h = steps.longest
+        most = jnp.abs(h) * _rate(system, system.time(steps.t0), y, h) / 2
+        yes &= most <= _MOST_FRICTION
+    return lax.stop_gradient(jnp.where(yes, first, MOST_STEPS))
 
 
 class Stencils(eqx.Module):
@@ -113,9 +104,14 @@ class Stencils(eqx.Module):
 
     first: Int[Array, " rows+1"]  # node; the last is never reached
     weights: Float[Array, "rows nodes 3"]
-    ways: Ways
+    first_node: Int[Array, ""]  # that may be used
+    # The first row that is interpolated; the earliest and the latest of these among the
+    # members of a batch.
+    begin: Int[Array, ""]
+    earliest: Int[Array, ""]
+    latest: Int[Array, ""]
 
-    def __init__(self, steps: Steps, rows: Rows, last: Array, ways: Ways):
+    def __init__(self, steps: Steps, rows: Rows, last: Array, first_node: Array):
         stop = jnp.maximum(rows.stop, 0)
         begin = steps.time(stop)
         low, high = steps.smooth_part(stop)
@@ -129,7 +125,12 @@ class Stencils(eqx.Module):
         else:
             nodes = [(steps.time(first + i) - begin) / unit for i in range(NODES)]
         self.weights = _weights(s, nodes, unit)
-        self.ways, due = ways, ways.some & rows.reached(last)
+        number = len(rows)
+        before = (rows.stop >= 0) & (first < first_node)
+        self.begin = jnp.max(jnp.where(before, jnp.arange(number) + 1, 0), initial=0)
+        self.latest = tree.largest_member(self.begin)
+        self.earliest = number - tree.largest_member(number - self.begin)
+        self.first_node, due = first_node, rows.reached(last)
         # A gap in measured times is saved at once, whatever it is.
         first = jnp.where(rows.stop < 0, -NODES, jnp.where(due, first, last + 1))
         self.first = jnp.append(first, last + 1)
@@ -138,9 +139,14 @@ class Stencils(eqx.Module):
     def last(self) -> Int[Array, " rows+1"]:
         return self.first + NODES - 1
 
+    @property
+    def interpolated(self) -> Bool[Array, " rows"]:
+        """Which rows are; the others are shorter steps."""
+        return jnp.arange(len(self.weights)) >= self.begin
+
     def known(self, rows: Rows) -> Int[Array, " rows"]:
         """The number of steps after which each row is known."""
-        here = self.ways.interpolated & (rows.stop >= 0)
+        here = self.interpolated & (rows.stop >= 0)
         return jnp.where(here, self.last[:-1], rows.known)
 
     def combine(self, j: Array, ring: Node) -> State:

@@ -6,7 +6,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
+from jaxtyping import Array, Int, PyTree
 
 from .. import _tree as tree
 from .._numbers import Scalar, State
@@ -15,7 +15,7 @@ from .._scheme._base import AbstractPresymplecticSolver, Point
 from .._scheme._engine import Result
 from .._system._bound import System
 from ._base import AbstractSteps
-from ._nodes import derivatives, Node, Stencils, Ways
+from ._nodes import derivatives, first_node, Node, Stencils
 from ._rows import Rows
 from ._steps import Steps
 
@@ -91,10 +91,10 @@ class Problem(eqx.Module):
                 ),
                 *(n, n, start),
             )
-            ways = Ways(system, steps, self.last, start[0])
+            first = first_node(system, steps, self.last, start[0])
             for i, rows in enumerate(self.rows):
                 if rows.may_be_inside:
-                    stencils = Stencils(steps, rows, self.last, ways)
+                    stencils = Stencils(steps, rows, self.last, first)
                     self.stencils[i] = stencils
                     self.rows[i] = rows.known_after(stencils.known(rows))
 
@@ -119,10 +119,11 @@ class Problem(eqx.Module):
         self.progress_meter, self.meter = meters
 
     @property
-    def interpolates(self) -> Bool[ArrayLike, ""]:
-        """Whether values between steps take no step."""
-        stencils = [x for x in self.stencils if x is not None]
-        return stencils[0].ways.interpolated if stencils else False
+    def number_interpolated(self) -> Int[Array, ""]:
+        """The number of values that take no step."""
+        pairs = zip(self.rows, self.stencils, strict=True)
+        rows = [(x.taken(self.last), y.interpolated) for x, y in pairs if y is not None]
+        return jnp.asarray(sum(jnp.sum(taken & here) for taken, here in rows), int)
 
     @property
     def last(self) -> Int[Array, ""]:

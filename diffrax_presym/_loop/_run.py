@@ -23,7 +23,7 @@ from .._scheme._engine import cheap_iterations
 from ._base import MOST_STEPS, Stop
 from ._problem import Problem
 from ._rows import Rows
-from ._tracks import AbstractTrack, Interpolated, put, Track
+from ._tracks import AbstractTrack, choose_rows, Interpolated, put, Track
 from ._variable import Timed
 
 
@@ -72,14 +72,14 @@ def run(problem: Problem, kept: AbstractTrack | None = None):
                 found, at_steps = at_steps
                 rows = rows.found(*found)
             values, each = at_steps
-            good = jnp.all(each | ~rows.taken(progress.n))
             if inside is not None:
                 (new, ys), nodes = inside
                 stencils = problem.stencils[i]
                 assert stencils is not None
-                way = stencils.ways.interpolated
-                values, good = tree.where(way, (new, nodes), (values, good))
-            finite &= good
+                here = stencils.interpolated
+                each, finite = each | here, finite & nodes
+                values = choose_rows(here, new, values)
+            finite &= jnp.all(each | ~rows.taken(progress.n))
         saved.append(values)
         between.append(ys)
         all_rows.append(rows)
@@ -113,7 +113,8 @@ def _tracks(
         found = lambda j, n, inside, point: saved(j, point, found=(n, inside))[1:]
         return Timed(rows.time, found, (init, jnp.asarray(True))), None
     if stencils is not None:
-        stops = rows.stop, due & stencils.ways.others, problem.last + 1
+        due &= jnp.arange(len(rows)) < stencils.latest
+        stops = rows.stop, due, problem.last + 1
     value = lambda j, point: saved(j, point)[1:]
     at_steps = Track(*stops, value, (init, jnp.asarray(True)))
     if stencils is None:
@@ -227,8 +228,8 @@ def saved_rows(
         taken = rows.taken(n)
 
         def place(xs: Array, x: Array) -> Array:
-            keep = taken.reshape(-1, *(1,) * (x.ndim - 1))
-            x = jnp.where(keep, x.astype(xs.dtype), xs[first : first + len(x)])
+            old = xs[first : first + len(x)]
+            x = choose_rows(taken, x.astype(xs.dtype), old)
             return lax.dynamic_update_slice_in_dim(xs, x, first, 0)
 
         ts, ys = place(ts, rows.time), jtu.tree_map(place, ys, values)

@@ -205,20 +205,22 @@ class Steps(AbstractSteps):
     def longest(self) -> Float[Array, ""]:
         return jnp.max(self.length if self.ts is None else jnp.diff(self.ts))
 
-    def largest_friction(self, system: System, last: Array) -> Float[Array, ""]:
-        """Over a step: the logarithm of a decay, or half of the angle of a rotation."""
+    def weak_from(self, system: System, last: Array, most: float) -> Int[Array, ""]:
+        """The first step from which on there is at most so much friction over each: the
+        logarithm of a decay, or half of the angle of a rotation."""
         friction = system.friction
         assert friction is not None
 
-        def most(n: Array) -> Array:
+        def after(n: Array, first: Array) -> Array:
             t0, t1, h = self.span(system, n)
             start, h = jnp.minimum(t0, t1), jnp.abs(h)
-            return jnp.maximum(friction.growth(start, h), friction.angle(h))
+            weak = jnp.maximum(friction.growth(start, h), friction.angle(h)) <= most
+            return jnp.where(weak, first, n + 1)
 
+        zero = jnp.zeros((), int)
         if self.are_equal and friction.is_autonomous:
-            return most(jnp.zeros((), int))
-        body = lambda n, x: jnp.maximum(x, most(n))
-        return lax.fori_loop(0, last, body, most(jnp.zeros((), int)))
+            return jnp.where(after(zero, zero) == 0, 0, last)
+        return lax.fori_loop(0, last, after, zero)
 
     def span(self, system: System, n: Int[Array, ""]) -> Span:
         """Step `n`, in physical time."""

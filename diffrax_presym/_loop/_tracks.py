@@ -83,8 +83,10 @@ class Interpolated(AbstractTrack):
     def start(self):
         ring = stack((self.y, self.y, self.y), NODES)
         number = len(self.stencils.first) - 1
-        zero = jnp.zeros((), int)
-        return zero, zero, ring, stack(self.init, number), jnp.asarray(True)
+        rows = stack(self.init, number)
+        return *(jnp.zeros((), int), self.stencils.earliest, ring, rows), jnp.asarray(
+            True
+        )
 
     def due(self, state):
         n, j, *_ = state
@@ -95,7 +97,9 @@ class Interpolated(AbstractTrack):
         kink = jnp.zeros((), int)
         if self.kinks is not None:
             kink = jnp.any(self.kinks == n).astype(int)
-        node = self.node(n, -kink, point)
+        # Others may not be finite, and are of members of a batch that do not use them.
+        m = jnp.maximum(n, self.stencils.first_node)
+        node = self.node(m, -kink, point)
         ring = put_here(ring, n % NODES, node, here)
         complete = lambda j: here & (self.stencils.last[j] <= n)
 
@@ -108,7 +112,7 @@ class Interpolated(AbstractTrack):
         more = lambda x: tree.any_member(complete(x[0]))
         j, rows = lax.while_loop(more, save, (j, rows))
         if self.kinks is not None:
-            other = lambda: self.node(n, kink, point)
+            other = lambda: self.node(m, kink, point)
             after = lambda: put_here(ring, n % NODES, other(), here)
             ring = lax.cond(kink == 1, after, lambda: ring)
         finite &= ~here | tree.all_finite(node)
@@ -121,6 +125,12 @@ class Interpolated(AbstractTrack):
 
 def stack(x: PyTree, number: int) -> PyTree:
     return jtu.tree_map(lambda x: jnp.broadcast_to(x, (number, *jnp.shape(x))), x)
+
+
+def choose_rows(here: Bool[Array, " rows"], new: PyTree, old: PyTree) -> PyTree:
+    """The rows of `new` that are `here`, the others of `old`."""
+    where = lambda x, y: jnp.where(here.reshape(-1, *(1,) * (x.ndim - 1)), x, y)
+    return jtu.tree_map(where, new, old)
 
 
 def put(
