@@ -235,13 +235,15 @@ class PullNodes(AbstractPull):
     stencils: Stencils
 
     def start(self, backward):
-        n, node = backward.trace.n, (backward.trace.end[0],) * 3
-        number = jnp.argmax(self.stencils.last > n)  # the first that is not known
+        n, node = backward.trace.n, stack(backward.trace.end[0], 3)
+        number = jnp.argmax(
+            self.stencils.last(slice(None)) > n
+        )  # the first that is not known
         return n + 1, n + 1, number, _zeros(stack(node, NODES))
 
     def due(self, state, n):
         node, low, j, _ = state
-        last = self.stencils.last[j - 1]
+        last = self.stencils.last(j - 1)
         row = jnp.where(last < 0, n, last)
         row = jnp.where(j > self.stencils.earliest, row, -1)
         return jnp.where(node > low, node - 1, row)
@@ -266,7 +268,7 @@ class PullNodes(AbstractPull):
             return tree.add(gradient, more), low, j, bars
 
         def unspread(x):
-            last = self.stencils.last[x[2] - 1]
+            last = self.stencils.last(x[2] - 1)
             return (x[2] > self.stencils.earliest) & ((last < 0) | (last >= n))
 
         def pull(side: Array, at: BackwardState, bars: PyTree):

@@ -5,6 +5,7 @@ time, the nodes, and their first two derivatives along the motion.
 """
 
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -32,8 +33,9 @@ _MOST_RATIO = 2.0
 # Power iterations for the rate of friction that depends on the state.
 _ITERATIONS = 8
 
-# A state and its first two derivatives.
-Node = tuple[State, State, State]
+# A state and its first two derivatives, stacked: as few arrays as possible, because
+# XLA runs many independent operations on a CPU by several threads, which takes longer.
+Node = State
 
 
 def derivatives(
@@ -53,7 +55,8 @@ def derivatives(
     if system.external is not None:
         moment = _moment(jnp.where(side < 0, -h, h))
         t, y = t + cast_to(moment, t), tree.add_scaled(y, moment, first)
-    return known, first, jax.jvp(slope, (t, y), along)[1]
+    second = jax.jvp(slope, (t, y), along)[1]
+    return jtu.tree_map(lambda *x: jnp.stack(x), known, first, second)
 
 
 def _moment(h: Array) -> Array:
@@ -135,9 +138,9 @@ class Stencils(eqx.Module):
         first = jnp.where(rows.stop < 0, -NODES, jnp.where(due, first, last + 1))
         self.first = jnp.append(first, last + 1)
 
-    @property
-    def last(self) -> Int[Array, " rows+1"]:
-        return self.first + NODES - 1
+    def last(self, j: Any) -> Int[Array, "..."]:
+        """The last node of a row, or of several."""
+        return self.first[j] + NODES - 1
 
     @property
     def interpolated(self) -> Bool[Array, " rows"]:
@@ -147,7 +150,7 @@ class Stencils(eqx.Module):
     def known(self, rows: Rows) -> Int[Array, " rows"]:
         """The number of steps after which each row is known."""
         here = self.interpolated & (rows.stop >= 0)
-        return jnp.where(here, self.last[:-1], rows.known)
+        return jnp.where(here, self.last(slice(-1)), rows.known)
 
     def combine(self, j: Array, ring: Node) -> State:
         """The state in row `j`, from a ring of nodes."""
@@ -155,27 +158,26 @@ class Stencils(eqx.Module):
         # Each index once, as many of them take long to trace.
         at = lambda x, i: lax.dynamic_index_in_dim(x, i, keepdims=False)
         weights, first = at(self.weights, j), self.first[j]
-        places = [(first + i) % NODES for i in range(NODES)]
+        nodes = [((first + i) % NODES, weight) for i, weight in enumerate(weights)]
 
-        def leaf(*data: Array) -> Array:
-            total = jnp.zeros(data[0].shape[1:], data[0].dtype)
-            for i, place in enumerate(places):
-                for order, x in enumerate(data):
-                    total = total + cast_to(weights[i, order], x) * at(x, place)
+        def leaf(ring: Array) -> Array:
+            total = jnp.zeros(ring.shape[2:], ring.dtype)
+            for place, weight in nodes:
+                for w, x in zip(cast_to(weight, ring), at(ring, place), strict=True):
+                    total = total + w * x
             return total
 
-        return jtu.tree_map(leaf, *ring)
+        return jtu.tree_map(leaf, ring)
 
     def spread(self, j: Array, bar: State, ring: Node) -> Node:
         """The transpose: the cotangents of the nodes, added to a ring of these."""
         place = (jnp.arange(NODES) - self.first[j]) % NODES
 
-        def leaf(order: int, x: Array, bar: Array) -> Array:
-            weights = cast_to(self.weights[j, place, order], bar)
-            return x + weights.reshape(-1, *(1,) * bar.ndim) * bar[None]
+        def leaf(x: Array, bar: Array) -> Array:
+            weights = cast_to(self.weights[j, place], bar)
+            return x + jnp.expand_dims(weights, range(2, x.ndim)) * bar[None, None]
 
-        one = lambda order: jtu.tree_map(lambda *x: leaf(order, *x), ring[order], bar)
-        return one(0), one(1), one(2)
+        return jtu.tree_map(leaf, ring, bar)
 
 
 def _weights(s: Array, nodes: list, unit: Array) -> Array:

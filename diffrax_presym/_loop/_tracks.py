@@ -81,7 +81,7 @@ class Interpolated(AbstractTrack):
     init: PyTree
 
     def start(self):
-        ring = stack((self.y, self.y, self.y), NODES)
+        ring = stack(stack(self.y, 3), NODES)
         number = len(self.stencils.first) - 1
         rows = stack(self.init, number)
         return *(jnp.zeros((), int), self.stencils.earliest, ring, rows), jnp.asarray(
@@ -101,7 +101,7 @@ class Interpolated(AbstractTrack):
         m = jnp.maximum(n, self.stencils.first_node)
         node = self.node(m, -kink, point)
         ring = put_here(ring, n % NODES, node, here)
-        complete = lambda j: here & (self.stencils.last[j] <= n)
+        complete = lambda j: here & (self.stencils.last(j) <= n)
 
         def save(x):
             j, rows = x
