@@ -146,6 +146,33 @@ def test_few_steps_and_schemes_of_order_two_take_shorter_steps():
     assert not solve(dps.PresymplecticLeapfrog(), 40).stats["interpolated"]
 
 
+def test_values_at_the_ends_of_steps_cost_no_evaluation():
+    calls = []
+
+    def force(t, q, args):
+        jax.debug.callback(lambda: calls.append(1))
+        return -jnp.sin(q)
+
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), dps.ForceField(force))
+
+    def evaluations(ts) -> Any:
+        calls.clear()
+        sol: Any = dfx.diffeqsolve(
+            *(system, RKN4, 0.0, T1, T1 / 40, (Y0[0] + 0.5, Y0[1])),
+            saveat=dfx.SaveAt(ts=ts) if len(ts) else dfx.SaveAt(steps=True),
+            adjoint=dps.FixedStepAdjoint(),
+            max_steps=40,
+        )
+        jax.block_until_ready(sol.ys)
+        jax.effects_barrier()
+        return len(calls), np.stack(sol.ys)
+
+    alone, steps = evaluations(TS[:0])
+    at_ends, ys = evaluations(TS[4::8])
+    assert np.array_equal(ys, steps[:, ::2]) and at_ends == alone
+    assert evaluations(TS[4::3])[0] > at_ends
+
+
 def test_single_precision_at_late_times():
     ts = jnp.float32(1e5) + jnp.linspace(0.0, 16.0, 65, dtype=jnp.float32)
     system = dps.MechanicalSystem(dps.QuadraticKinetic(), dps.QuadraticPotential())

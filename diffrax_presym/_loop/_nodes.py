@@ -108,6 +108,7 @@ class Stencils(eqx.Module):
     first: Int[Array, " rows+1"]  # node; the last is never reached
     weights: Float[Array, "rows nodes 3"]
     first_node: Int[Array, ""]  # that may be used
+    number: Int[Array, ""]  # of values where a polynomial can follow the solution
     # The first row that is interpolated; the earliest and the latest of these among the
     # members of a batch.
     begin: Int[Array, ""]
@@ -128,12 +129,15 @@ class Stencils(eqx.Module):
         else:
             nodes = [(steps.time(first + i) - begin) / unit for i in range(NODES)]
         self.weights = _weights(s, nodes, unit)
-        number = len(rows)
+        number, due = len(rows), rows.reached(last)
         before = (rows.stop >= 0) & (first < first_node)
-        self.begin = jnp.max(jnp.where(before, jnp.arange(number) + 1, 0), initial=0)
+        begin = jnp.max(jnp.where(before, jnp.arange(number) + 1, 0), initial=0)
+        self.number = jnp.sum(rows.taken(last) & (jnp.arange(number) >= begin))
+        # Values at the ends of steps need no nodes, if they are the only ones.
+        self.begin = jnp.where(jnp.any(rows.inside), begin, number)
         self.latest = tree.largest_member(self.begin)
         self.earliest = number - tree.largest_member(number - self.begin)
-        self.first_node, due = first_node, rows.reached(last)
+        self.first_node = first_node
         # A gap in measured times is saved at once, whatever it is.
         first = jnp.where(rows.stop < 0, -NODES, jnp.where(due, first, last + 1))
         self.first = jnp.append(first, last + 1)

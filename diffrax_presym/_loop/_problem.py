@@ -120,10 +120,9 @@ class Problem(eqx.Module):
 
     @property
     def number_interpolated(self) -> Int[Array, ""]:
-        """The number of values that take no step."""
-        pairs = zip(self.rows, self.stencils, strict=True)
-        rows = [(x.taken(self.last), y.interpolated) for x, y in pairs if y is not None]
-        return jnp.asarray(sum(jnp.sum(taken & here) for taken, here in rows), int)
+        """The number of values where a polynomial can follow the solution."""
+        stencils = [x for x in self.stencils if x is not None]
+        return jnp.asarray(sum(x.number for x in stencils), int)
 
     @property
     def last(self) -> Int[Array, ""]:
