@@ -14,7 +14,7 @@ from .._scheme._base import Point
 from ._backward import Backward, BackwardState
 from ._base import MOST_STEPS
 from ._problem import Problem
-from ._tracks import AbstractTrack, Track
+from ._tracks import AbstractTrack, stops_due, Track
 from ._variable import Kept
 
 
@@ -187,7 +187,7 @@ def _track(places: Array, problem: Problem) -> AbstractTrack:
     """What is kept: the steps, and the states at their starts."""
     last, value = problem.last, lambda j, point: (places[j], point)
     none = jnp.asarray(MOST_STEPS, places.dtype), problem.start
-    return Track(places, places <= last, last + 1, value, none)
+    return Track(stops_due(places, places <= last, last + 1), value, none)
 
 
 def _until(last: Array, places: Array) -> Array:

@@ -17,13 +17,14 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Int, PyTree
 
 from .. import _tree as tree
+from .._numbers import State
 from .._results import NONFINITE
 from .._scheme._base import Point
 from .._scheme._engine import cheap_iterations
 from ._base import MOST_STEPS, Stop
 from ._problem import Problem
 from ._rows import Rows
-from ._tracks import AbstractTrack, choose_rows, Interpolated, put, Track
+from ._tracks import AbstractTrack, Between, choose_rows, put, stops_due, Track
 from ._variable import Timed
 
 
@@ -56,29 +57,25 @@ def run(problem: Problem, kept: AbstractTrack | None = None):
     """The end of a solve, what each output saved, and a trace, with the states `kept`
     for a gradient."""
     number, keep = len(problem.rows), kept is not None
-    tracks = [_tracks(problem, i, keep) for i in range(number)]
+    tracks = [_track(problem, i, keep) for i in range(number)]
     end, n, (stacked, kept_states) = _run_steps(problem, (tracks, kept))
     progress = eqx.tree_at(lambda x: x.n, end, n)
 
     saved, between, finite = [], [], tree.all_finite(progress.point[0])
     all_rows = []
-    for i, (at_steps, inside) in enumerate(stacked):
+    for i, collected in enumerate(stacked):
         values, ys, rows = None, None, problem.rows[i]
-        if at_steps is not None:
+        if problem.stencils[i] is not None:
+            (values, ys), good = collected
+            finite &= good
+        elif collected is not None:
             if not rows.has_times:
-                time, *at_steps = at_steps
+                time, *collected = collected
                 rows = rows.at(time)
             elif not problem.steps.are_known:
-                found, at_steps = at_steps
+                found, collected = collected
                 rows = rows.found(*found)
-            values, each = at_steps
-            if inside is not None:
-                (new, ys), nodes = inside
-                stencils = problem.stencils[i]
-                assert stencils is not None
-                here = stencils.interpolated
-                each, finite = each | here, finite & nodes
-                values = choose_rows(here, new, values)
+            values, each = collected
             finite &= jnp.all(each | ~rows.taken(progress.n))
         saved.append(values)
         between.append(ys)
@@ -95,35 +92,36 @@ def run(problem: Problem, kept: AbstractTrack | None = None):
     return (progress, result, saved), trace
 
 
-def _tracks(
-    problem: Problem, i: int, keep: bool
-) -> tuple[AbstractTrack | None, Interpolated | None]:
-    """What output `i` collects at steps, or by shorter ones, and what between them:
-    values, and the states of which these are if they are to `keep`."""
+def _track(problem: Problem, i: int, keep: bool) -> AbstractTrack | None:
+    """What output `i` collects: values, and the states of those between steps if they
+    are to `keep`."""
     rows, stencils, functions = problem.rows[i], problem.stencils[i], problem.functions
     if len(rows) == 0:
-        return None, None
+        return None
     y, output = problem.start[0], functions.outputs[i]
     init, due = output(problem.steps.t0, y), rows.reached(problem.last)
     saved = partial(problem.output, i, functions)
-    stops = rows.stop, due, problem.last + 1
+    stops = stops_due(rows.stop, due, problem.last + 1)
     if not rows.has_times:
-        return Track(*stops, saved, (problem.steps.t0, init, jnp.asarray(True))), None
+        return Track(stops, saved, (problem.steps.t0, init, jnp.asarray(True)))
     if not problem.steps.are_known:
         found = lambda j, n, inside, point: saved(j, point, found=(n, inside))[1:]
-        return Timed(rows.time, found, (init, jnp.asarray(True))), None
-    if stencils is not None:
-        due &= jnp.arange(len(rows)) < stencils.latest
-        stops = rows.stop, due, problem.last + 1
-    value = lambda j, point: saved(j, point)[1:]
-    at_steps = Track(*stops, value, (init, jnp.asarray(True)))
+        return Timed(rows.time, found, (init, jnp.asarray(True)))
     if stencils is None:
-        return at_steps, None
+        value = lambda j, point: saved(j, point)[1:]
+        return Track(stops, value, (init, jnp.asarray(True)))
     assert functions.node is not None
+
+    def step(j: Array, point: Point) -> State:
+        where = rows.stop[j], point, rows.time[j], rows.inside[j]
+        return problem.between(functions, *where)
+
+    due &= jnp.arange(len(rows)) < stencils.latest
+    stops = stops_due(rows.stop, due, problem.last + 1)
     kept = lambda y: y if keep else None
     value = lambda j, y: (output(rows.time[j], y), kept(y))
     kinks, init = problem.steps.kinks, (init, kept(y))
-    return at_steps, Interpolated(stencils, kinks, functions.node, value, y, init)
+    return Between(stencils, stops, kinks, step, functions.node, value, y, init)
 
 
 def _run_steps(problem: Problem, tracks: PyTree) -> tuple[Progress, Array, PyTree]:

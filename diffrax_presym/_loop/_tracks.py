@@ -50,10 +50,6 @@ class Track(AbstractTrack):
     value: Callable[[Array, Point], PyTree]  # of the row and the state there
     init: PyTree
 
-    def __init__(self, stops, is_due, never, value: Callable, init: PyTree):
-        self.stops = jnp.append(jnp.where(is_due, stops, never), never)
-        self.value, self.init = value, init
-
     def start(self):
         return jnp.zeros((), int), stack(self.init, len(self.stops) - 1)
 
@@ -70,30 +66,67 @@ class Track(AbstractTrack):
         return state[1]
 
 
-class Interpolated(AbstractTrack):
-    """Values between steps, from the last few ends of steps."""
+class Collected(eqx.Module):
+    """What has been collected of values between steps."""
+
+    shorter: Int[Array, ""]  # the next row that is a shorter step
+    node: Int[Array, ""]  # the next node, if there are rows left for which it is one
+    interpolated: Int[Array, ""]  # the next row that is interpolated
+    ring: Node  # the last nodes
+    rows: PyTree
+    finite: Bool[Array, ""]  # whether all states were
+
+
+class Between(AbstractTrack):
+    """Values between steps, the first by shorter steps, the others from the last few
+    ends of steps."""
 
     stencils: Stencils
+    stops: Int[Array, " rows+1"]  # of shorter steps, then one that is never reached
     kinks: Int[Array, " kinks"] | None  # the steps before which derivatives jump
+    step: Callable[[Array, Point], State]  # the state in a row, by a shorter step
     node: Callable[[Array, Array, Point], Node]
     value: Callable[[Array, State], PyTree]  # of the row and the state in it
     y: State  # any
     init: PyTree
 
     def start(self):
-        ring = stack(stack(self.y, 3), NODES)
-        number = len(self.stencils.first) - 1
-        rows = stack(self.init, number)
-        return *(jnp.zeros((), int), self.stencils.earliest, ring, rows), jnp.asarray(
-            True
-        )
+        ring, zero = stack(stack(self.y, 3), NODES), jnp.zeros((), int)
+        rows = stack(self.init, len(self.stencils.first) - 1)
+        begin = self.stencils.earliest
+        return Collected(zero, zero, begin, ring, rows, jnp.asarray(True))
+
+    def _due(self, state: Collected) -> tuple[Array, Array]:
+        first = self.stencils.first[state.interpolated]
+        return self.stops[state.shorter], jnp.maximum(state.node, first)
 
     def due(self, state):
-        n, j, *_ = state
-        return Stop(jnp.maximum(n, self.stencils.first[j]))
+        return Stop(jnp.minimum(*self._due(state)))
 
     def visit(self, state, n, point, here):
-        due, j, ring, rows, finite = state
+        for due, visit in zip(
+            self._due(state), (self._step, self._visit_node), strict=True
+        ):
+            own = here & (due == n)
+            go = lambda state, own=own, visit=visit: visit(state, n, point, own)
+            state = lax.cond(tree.any_member(own), go, lambda state: state, state)
+        return state
+
+    def _step(self, state: Collected, n: Array, point: Point, here: Array) -> Collected:
+        j = state.shorter
+        y = self.step(j, point)
+        # A member of a batch that interpolates it does so later.
+        rows = put_here(state.rows, j, self.value(j, y), here)
+        finite = state.finite & (
+            ~here | (j >= self.stencils.begin) | tree.all_finite(y)
+        )
+        new = j + here.astype(j.dtype), rows, finite
+        return eqx.tree_at(lambda x: (x.shorter, x.rows, x.finite), state, new)
+
+    def _visit_node(
+        self, state: Collected, n: Array, point: Point, here: Array
+    ) -> Collected:
+        ring, finite = state.ring, state.finite
         kink = jnp.zeros((), int)
         if self.kinks is not None:
             kink = jnp.any(self.kinks == n).astype(int)
@@ -105,22 +138,31 @@ class Interpolated(AbstractTrack):
 
         def save(x):
             j, rows = x
-            own = complete(j)
+            done = complete(j)
             y = self.stencils.combine(j, ring)
-            return j + own.astype(j.dtype), put_here(rows, j, self.value(j, y), own)
+            own = done & (j >= self.stencils.begin)
+            return j + done.astype(j.dtype), put_here(rows, j, self.value(j, y), own)
 
         more = lambda x: tree.any_member(complete(x[0]))
-        j, rows = lax.while_loop(more, save, (j, rows))
+        j, rows = lax.while_loop(more, save, (state.interpolated, state.rows))
         if self.kinks is not None:
             other = lambda: self.node(m, kink, point)
             after = lambda: put_here(ring, n % NODES, other(), here)
             ring = lax.cond(kink == 1, after, lambda: ring)
         finite &= ~here | tree.all_finite(node)
-        return jnp.where(here, n + 1, due), j, ring, rows, finite
+        due = jnp.where(here, n + 1, state.node)
+        return Collected(state.shorter, due, j, ring, rows, finite)
 
     def rows(self, state):
-        """They, and whether all nodes were finite."""
-        return state[3:]
+        """They, and whether all states were finite."""
+        return state.rows, state.finite
+
+
+def stops_due(
+    stops: Int[Array, " rows"], due: Bool[Array, " rows"], never: Array
+) -> Int[Array, " rows+1"]:
+    """Those of the first rows, which are due, and then one that is never reached."""
+    return jnp.append(jnp.where(due, stops, never), never)
 
 
 def stack(x: PyTree, number: int) -> PyTree:
