@@ -1,5 +1,7 @@
 """The public diagnostics, against known values."""
 
+from typing import Any
+
 import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
@@ -51,6 +53,23 @@ def test_energy_error_is_that_of_the_solver(term):
     assert np.max(np.abs(fine)) < 1e-8
     assert 1e-4 < np.max(np.abs(coarse)) < 1e-1
     assert fine[0] == 0 and fine.shape == (641,)
+
+
+@pytest.mark.parametrize("balance", [diagnostics.energy_error, energy_lost])
+def test_a_balance_goes_on_after_a_gap_in_measured_times(balance):
+    gaps = np.array([0, 3, 4, 8])
+    sol: Any = dfx.diffeqsolve(
+        *(DRIVEN, dps.PresymplecticLeapfrog(), 1.0, 5.0, 0.05, Y0, 0.7),
+        saveat=dfx.SaveAt(ts=jnp.linspace(1.0, 5.0, 9).at[gaps].set(jnp.nan)),
+        adjoint=dps.FixedStepAdjoint(),
+    )
+    q, p = sol.ys
+    kept = np.delete(np.arange(9), gaps)
+    alone = balance(DRIVEN, sol.ts[kept], (q[kept], p[kept]), 0.7)
+    found = balance(DRIVEN, sol.ts, (q, p), 0.7)[kept]
+    assert found[0] == 0 and np.ptp(alone) > 2e-4
+    np.testing.assert_allclose(found, alone, 0, 1e-13)
+    assert not len(balance(DRIVEN, TS[:0], (YS[0][:0], YS[1][:0]), 0.7))
 
 
 def test_energy_error_of_a_conserved_energy_is_its_change():

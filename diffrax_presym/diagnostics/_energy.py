@@ -57,9 +57,10 @@ def energy_error(
 
     As `diagnostics.energy`.
     """
-    done = _integral(_power, system, ts, ys, args)
-    balance = energy(system, ts, ys, args)
-    return balance - balance[0] - done
+    error = energy(system, ts, ys, args) - _integral(_power, system, ts, ys, args)
+    if not len(ts):
+        return error
+    return error - error[jnp.argmax(jnp.isfinite(as_time(ts)))]
 
 
 def power_lost(
@@ -123,8 +124,11 @@ def _power_lost(system: AbstractSystem, t, y: State, args: PyTree):
 def _integral(
     power: Callable, system: AbstractSystem, ts: Times, ys: State, args: PyTree
 ) -> Times:
-    """The integral up to each saved time of a function of time and state."""
+    """The integral up to each saved time of a function of time and state, from the
+    first that is not a gap in measured times."""
     ts = as_time(ts)
+    if not len(ts):
+        return jnp.zeros_like(ts)
     eps = max(float(jnp.finfo(y.dtype).eps) for y in jtu.tree_leaves(ys))
     tolerance = 100 * eps
 
@@ -134,8 +138,6 @@ def _integral(
             power(system, t, x[0], args),
         )
         zero = jnp.zeros_like(power(system, t0, y0, args))
-        # Nothing was saved beyond the last step.
-        t1 = jnp.where(jnp.isfinite(t1), t1, t0)
         sol = dfx.diffeqsolve(
             dfx.ODETerm(field),
             dfx.Dopri8(),
@@ -148,8 +150,14 @@ def _integral(
         good = sol.result == dfx.RESULTS.successful
         return jnp.where(good, sol.ys[1][0], jnp.nan)
 
-    starts = jtu.tree_map(lambda y: y[:-1], ys)
-    parts = jax.vmap(one)(ts[:-1], ts[1:], starts)
+    # Nothing was saved in gaps, and beyond the last step.
+    saved = jnp.isfinite(ts)
+    last = jax.lax.cummax(jnp.where(saved, jnp.arange(len(ts)), 0))[:-1]
+    starts = jtu.tree_map(lambda y: y[last], ys)
+    known = saved[1:] & saved[last]
+    begin, end = (jnp.where(known, t, 0) for t in (ts[last], ts[1:]))
+    parts = jax.vmap(one)(begin, end, starts)
+    parts = jnp.where(known, parts, 0)
     return jnp.concatenate([jnp.zeros(1, parts.dtype), jnp.cumsum(parts)])
 
 
