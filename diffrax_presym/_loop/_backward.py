@@ -236,9 +236,8 @@ class PullNodes(AbstractPull):
 
     def start(self, backward):
         n, node = backward.trace.n, stack(backward.trace.end[0], 3)
-        number = jnp.argmax(
-            self.stencils.last(slice(None)) > n
-        )  # the first that is not known
+        # The first that is not known.
+        number = jnp.argmax(self.stencils.last(slice(None)) > n)
         return n + 1, n + 1, number, _zeros(stack(node, NODES))
 
     def due(self, state, n):

@@ -101,6 +101,8 @@ def _track(problem: Problem, i: int, keep: bool) -> AbstractTrack | None:
     y, output = problem.start[0], functions.outputs[i]
     init, due = output(problem.steps.t0, y), rows.reached(problem.last)
     saved = partial(problem.output, i, functions)
+    if stencils is not None:
+        due &= jnp.arange(len(rows)) < stencils.latest
     stops = stops_due(rows.stop, due, problem.last + 1)
     if not rows.has_times:
         return Track(stops, saved, (problem.steps.t0, init, jnp.asarray(True)))
@@ -116,8 +118,6 @@ def _track(problem: Problem, i: int, keep: bool) -> AbstractTrack | None:
         where = rows.stop[j], point, rows.time[j], rows.inside[j]
         return problem.between(functions, *where)
 
-    due &= jnp.arange(len(rows)) < stencils.latest
-    stops = stops_due(rows.stop, due, problem.last + 1)
     kept = lambda y: y if keep else None
     value = lambda j, y: (output(rows.time[j], y), kept(y))
     kinks, init = problem.steps.kinks, (init, kept(y))
@@ -173,14 +173,9 @@ def _run_steps(problem: Problem, tracks: PyTree) -> tuple[Progress, Array, PyTre
         n, point = steps.number(first, progress.n), progress.point
         for track, state, next_stop in zip(flat, states, wanted, strict=True):
             here = steps.at(next_stop, n, point)
-            # Members of a batch that take the same steps are here together. The others
-            # are visited together, as JAX would otherwise copy all that was collected.
+            # Members of a batch that take the same steps are here together.
             alike = here if steps.are_known else here & going
-            some = tree.any_member(alike)
-            visit = lambda track=track, state=state, alike=alike: track.visit(
-                state, n, point, alike
-            )
-            new.append(lax.cond(some, visit, lambda state=state: state))
+            new.append(track.visit(state, n, point, alike))
         reached = jnp.where(going, progress.n, reached)
         return progress, new, reached, proceeds(progress, new)
 

@@ -3,7 +3,7 @@
 import abc
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -17,6 +17,9 @@ from .._numbers import cast_to, State
 from .._scheme._base import Point
 from ._base import Stop
 from ._nodes import Node, NODES, Stencils
+
+
+_T = TypeVar("_T")
 
 
 class AbstractTrack(eqx.Module):
@@ -36,7 +39,7 @@ class AbstractTrack(eqx.Module):
     @abc.abstractmethod
     def visit(self, state: PyTree, n: Array, point: Point, here: Any) -> PyTree:
         """The state after that, at the start of step `n`, for those members of a batch
-        that are `here`, as some are."""
+        that are `here`."""
 
     @abc.abstractmethod
     def rows(self, state: PyTree) -> PyTree:
@@ -57,10 +60,12 @@ class Track(AbstractTrack):
         return Stop(self.stops[state[0]])
 
     def visit(self, state, n, point, here):
-        j, rows = state
-        return j + jnp.asarray(here, j.dtype), put_here(
-            rows, j, self.value(j, point), here
-        )
+        def save(state):
+            j, rows = state
+            rows = put_here(rows, j, self.value(j, point), here)
+            return j + jnp.asarray(here, j.dtype), rows
+
+        return where_any(here, save, state)
 
     def rows(self, state):
         return state[1]
@@ -109,7 +114,7 @@ class Between(AbstractTrack):
         ):
             own = here & (due == n)
             go = lambda state, own=own, visit=visit: visit(state, n, point, own)
-            state = lax.cond(tree.any_member(own), go, lambda state: state, state)
+            state = where_any(own, go, state)
         return state
 
     def _step(self, state: Collected, n: Array, point: Point, here: Array) -> Collected:
@@ -130,8 +135,9 @@ class Between(AbstractTrack):
         kink = jnp.zeros((), int)
         if self.kinks is not None:
             kink = jnp.any(self.kinks == n).astype(int)
-        # Others may not be finite, and are of members of a batch that do not use them.
-        m = jnp.maximum(n, self.stencils.first_node)
+        # Before it, it may not be finite, in members of a batch that do not use it.
+        first = self.stencils.first_node
+        m = jnp.maximum(n, first)
         node = self.node(m, -kink, point)
         ring = put_here(ring, n % NODES, node, here)
         complete = lambda j: here & (self.stencils.last(j) <= n)
@@ -149,7 +155,7 @@ class Between(AbstractTrack):
             other = lambda: self.node(m, kink, point)
             after = lambda: put_here(ring, n % NODES, other(), here)
             ring = lax.cond(kink == 1, after, lambda: ring)
-        finite &= ~here | tree.all_finite(node)
+        finite &= ~here | (n < first) | tree.all_finite(node)
         due = jnp.where(here, n + 1, state.node)
         return Collected(state.shorter, due, j, ring, rows, finite)
 
@@ -163,6 +169,12 @@ def stops_due(
 ) -> Int[Array, " rows+1"]:
     """Those of the first rows, which are due, and then one that is never reached."""
     return jnp.append(jnp.where(due, stops, never), never)
+
+
+def where_any(here: Bool[Array, ""], visit: Callable[[_T], _T], state: _T) -> _T:
+    """`visit(state)`, if any member of a batch is `here`: they are asked together, as
+    JAX would otherwise copy all that was collected."""
+    return lax.cond(tree.any_member(here), visit, lambda state: state, state)
 
 
 def stack(x: PyTree, number: int) -> PyTree:

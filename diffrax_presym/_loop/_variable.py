@@ -20,7 +20,7 @@ from .._scheme._base import advance, check_step, Point
 from .._scheme._engine import backward, first_failure, prepare, Span
 from .._step_size._density import StepDensityController
 from ._base import AbstractSteps, MOST_STEPS, Stop
-from ._tracks import AbstractTrack, put, put_here, stack
+from ._tracks import AbstractTrack, put, put_here, stack, where_any
 
 
 class Clock(NamedTuple):
@@ -171,10 +171,14 @@ class Timed(AbstractTrack):
         return Stop(jnp.asarray(MOST_STEPS), jnp.where(left, t, jnp.inf))
 
     def visit(self, state, n, point, here):
-        j, found, rows = state
-        inside = self.times[j] > point[1][1].t.value
-        value = (n, inside), self.value(j, n, inside, point)
-        return j + jnp.asarray(here, j.dtype), *put_here((found, rows), j, value, here)
+        def save(state):
+            j, found, rows = state
+            inside = self.times[j] > point[1][1].t.value
+            value = (n, inside), self.value(j, n, inside, point)
+            rows = put_here((found, rows), j, value, here)
+            return j + jnp.asarray(here, j.dtype), *rows
+
+        return where_any(here, save, state)
 
     def rows(self, state):
         return state[1:]
@@ -195,6 +199,10 @@ class Kept(AbstractTrack):
         return Stop(count * every)
 
     def visit(self, state, n, point, here):
+        keep = lambda state: self._keep(state, n, point, here)
+        return where_any(here, keep, state)
+
+    def _keep(self, state: PyTree, n: Array, point: Point, here: Array) -> PyTree:
         count, every, rows = state
         full = (count == self.most) & here
         half = (self.most + 1) // 2
