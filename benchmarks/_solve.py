@@ -75,7 +75,7 @@ def states(
     ys = jax.tree.map(lambda y: jnp.where(good, y, jnp.nan), ys)
     if not count:
         return ys
-    return ys, sol.stats["num_steps"], sol.stats.get("interpolated", 0)
+    return ys, sol.stats["num_steps"], sol.stats.get("interpolated")
 
 
 def relative_error(y, exact):
