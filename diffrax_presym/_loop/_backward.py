@@ -271,8 +271,7 @@ class PullNodes(AbstractPull):
             return (x[2] > self.stencils.earliest) & ((last < 0) | (last >= n))
 
         def pull(side: Array, at: BackwardState, bars: PyTree):
-            m = jnp.maximum(n, self.stencils.first_node)
-            node = lambda functions, point: functions.node(m, side, point)
+            node = lambda functions, point: functions.node(n, side, point)
             bar = jtu.tree_map(lambda x: x[n % NODES], bars)
             at = at.add(*backward.pull(node, bar, at.point))
             return at, put(bars, n % NODES, _zeros(bar))

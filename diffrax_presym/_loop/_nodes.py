@@ -12,7 +12,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from .. import _tree as tree
 from .._numbers import cast_to, State
@@ -107,7 +107,6 @@ class Stencils(eqx.Module):
 
     first: Int[Array, " rows+1"]  # node; the last is never reached
     weights: Float[Array, "rows nodes 3"]
-    first_node: Int[Array, ""]  # that may be used
     number: Int[Array, ""]  # of values where a polynomial can follow the solution
     # The first row that is interpolated; the earliest and the latest of these among the
     # members of a batch.
@@ -137,7 +136,6 @@ class Stencils(eqx.Module):
         self.begin = jnp.where(jnp.any(rows.inside), begin, number)
         self.latest = tree.largest_member(self.begin)
         self.earliest = number - tree.largest_member(number - self.begin)
-        self.first_node = first_node
         # A gap in measured times is saved at once, whatever it is.
         first = jnp.where(rows.stop < 0, -NODES, jnp.where(due, first, last + 1))
         self.first = jnp.append(first, last + 1)
@@ -146,14 +144,9 @@ class Stencils(eqx.Module):
         """The last node of a row, or of several."""
         return self.first[j] + NODES - 1
 
-    @property
-    def interpolated(self) -> Bool[Array, " rows"]:
-        """Which rows are; the others are shorter steps."""
-        return jnp.arange(len(self.weights)) >= self.begin
-
     def known(self, rows: Rows) -> Int[Array, " rows"]:
         """The number of steps after which each row is known."""
-        here = self.interpolated & (rows.stop >= 0)
+        here = (jnp.arange(len(rows)) >= self.begin) & (rows.stop >= 0)
         return jnp.where(here, self.last(slice(-1)), rows.known)
 
     def combine(self, j: Array, ring: Node) -> State:

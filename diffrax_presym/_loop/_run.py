@@ -24,7 +24,7 @@ from .._scheme._engine import cheap_iterations
 from ._base import MOST_STEPS, Stop
 from ._problem import Problem
 from ._rows import Rows
-from ._tracks import AbstractTrack, Between, choose_rows, put, stops_due, Track
+from ._tracks import AbstractTrack, Between, put, stops_due, Track
 from ._variable import Timed
 
 
@@ -221,8 +221,8 @@ def saved_rows(
         taken = rows.taken(n)
 
         def place(xs: Array, x: Array) -> Array:
-            old = xs[first : first + len(x)]
-            x = choose_rows(taken, x.astype(xs.dtype), old)
+            keep = taken.reshape(-1, *(1,) * (x.ndim - 1))
+            x = jnp.where(keep, x.astype(xs.dtype), xs[first : first + len(x)])
             return lax.dynamic_update_slice_in_dim(xs, x, first, 0)
 
         ts, ys = place(ts, rows.time), jtu.tree_map(place, ys, values)

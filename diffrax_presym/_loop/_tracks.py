@@ -135,10 +135,7 @@ class Between(AbstractTrack):
         kink = jnp.zeros((), int)
         if self.kinks is not None:
             kink = jnp.any(self.kinks == n).astype(int)
-        # Before it, it may not be finite, in members of a batch that do not use it.
-        first = self.stencils.first_node
-        m = jnp.maximum(n, first)
-        node = self.node(m, -kink, point)
+        node = self.node(n, -kink, point)
         ring = put_here(ring, n % NODES, node, here)
         complete = lambda j: here & (self.stencils.last(j) <= n)
 
@@ -152,10 +149,10 @@ class Between(AbstractTrack):
         more = lambda x: tree.any_member(complete(x[0]))
         j, rows = lax.while_loop(more, save, (state.interpolated, state.rows))
         if self.kinks is not None:
-            other = lambda: self.node(m, kink, point)
+            other = lambda: self.node(n, kink, point)
             after = lambda: put_here(ring, n % NODES, other(), here)
             ring = lax.cond(kink == 1, after, lambda: ring)
-        finite &= ~here | (n < first) | tree.all_finite(node)
+        finite &= ~here | tree.all_finite(node)
         due = jnp.where(here, n + 1, state.node)
         return Collected(state.shorter, due, j, ring, rows, finite)
 
@@ -179,12 +176,6 @@ def where_any(here: Bool[Array, ""], visit: Callable[[_T], _T], state: _T) -> _T
 
 def stack(x: PyTree, number: int) -> PyTree:
     return jtu.tree_map(lambda x: jnp.broadcast_to(x, (number, *jnp.shape(x))), x)
-
-
-def choose_rows(here: Bool[Array, " rows"], new: PyTree, old: PyTree) -> PyTree:
-    """The rows of `new` that are `here`, the others of `old`."""
-    where = lambda x, y: jnp.where(here.reshape(-1, *(1,) * (x.ndim - 1)), x, y)
-    return jtu.tree_map(where, new, old)
 
 
 def put(
