@@ -1,5 +1,5 @@
-"""Saved values of variable steps, shorter steps or their ends: beside Kepler's equation
-and Diffrax's loop, and their gradients beside central differences."""
+"""Saved values of variable steps, within them or at their ends: beside Kepler's
+equation and Diffrax's loop, and their gradients beside central differences."""
 
 from functools import partial
 from typing import Any
@@ -68,7 +68,9 @@ def test_the_error_between_steps_is_that_at_their_ends(name):
     assert sol.stats["num_steps"] == n
     error = lambda ts, q: np.max(np.abs(q - positions(ts)))
     at_ends = error(ends.ts[:n], ends.ys[0][:n])
-    assert 1e-11 < error(TS, sol.ys[0]) < 1.5 * at_ends
+    inside = np.sum(~np.isin(TS, ends.ts[:n])) - 1  # the first time is the start
+    assert sol.stats["interpolated"] == inside
+    assert 1e-11 < error(TS, sol.ys[0]) < 2 * at_ends
 
 
 def test_saved_values_do_not_depend_on_other_saved_times():
@@ -120,7 +122,9 @@ def test_ends_of_steps_are_those_of_the_other_loop(saved, back):
     assert own.stats["num_steps"] == theirs.stats["num_steps"]
     both = [jax.tree.leaves((sol.ts, sol.ys)) for sol in (own, theirs)]
     for x, y in zip(*both, strict=True):
-        np.testing.assert_allclose(x, y, atol=1e-10)
+        # Within steps these are polynomials and shorter steps.
+        atol = 1e-8 if len(x) == 7 else 1e-10
+        np.testing.assert_allclose(x, y, atol=atol)
 
 
 # Gradients.
@@ -185,3 +189,89 @@ def test_the_time_at_which_the_most_steps_end_has_derivatives():
     own, other = (jax.grad(end)(START[0], adjoint) for adjoint in (OWN, THEIRS))
     assert jnp.max(jnp.abs(other)) > 0.1
     np.testing.assert_allclose(own, other, rtol=1e-9)
+
+
+# Values within steps, by polynomials or by shorter steps.
+
+
+def damped(law, ts, y0=START, adjoint=OWN, solver=None, **options):
+    potential = lambda t, q, args: jnp.sum(q**2) / 2 + jnp.sum(q**4) / 8
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), potential, law, **options)
+    # The steps differ by a factor of more than two.
+    density = lambda t, y, args: 1 / (1 + jnp.sum(y[0] ** 2))
+    return diffeqsolve(
+        *(system, solver or dps.BlanesMoanRKN4(), 0.0, 12.0, None, y0),
+        stepsize_controller=dps.StepDensityController(0.3, density),
+        saveat=dfx.SaveAt(ts=ts),
+        adjoint=adjoint,
+        max_steps=200,
+    )
+
+
+LAWS = {  # and of 81 values the least and the most that are interpolated
+    "none": (None, 70, 80),
+    "a constant": (dps.ConstantDamping(0.2), 70, 80),
+    "of time": (lambda t: 0.3 / (1 + t), 70, 80),
+    "strong at first": (dps.LogDamping(9.0, 1.0), 20, 70),
+    "singular at first": (dps.LogDamping(3.0, 0.0), 30, 70),
+    "of place": (dps.PositionDamping(lambda t, q, args: 0.1 * jnp.sum(q**2)), 0, 0),
+    "always strong": (dps.ConstantDamping(9.0), 0, 0),
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_values_within_steps_by_polynomials_where_these_follow(name):
+    (law, least, most), ts = LAWS[name], jnp.linspace(0.0, 12.0, 81)
+    y0 = (START[0], 0 * START[1]) if name == "singular at first" else START
+    own, other = (damped(law, ts, y0, adjoint) for adjoint in (OWN, THEIRS))
+    assert own.result == dfx.RESULTS.successful
+    assert least <= int(own.stats["interpolated"]) <= most
+    atol = 1e-12 if most == 0 else 1e-6
+    for x, y in zip(own.ys, other.ys, strict=True):
+        np.testing.assert_allclose(x, y, 0, atol)
+
+
+def test_schemes_up_to_order_two_and_constraints_take_shorter_steps():
+    ts = jnp.linspace(0.0, 12.0, 41)
+    sol = damped(None, ts, solver=dps.PresymplecticLeapfrog())
+    assert sol.stats["interpolated"] == 0
+    on_circle = dps.ConstrainedSystem(
+        dps.MechanicalSystem(dps.QuadraticKinetic(), lambda t, q, args: q[1]),
+        lambda t, q, args: q @ q - 1,
+    )
+    solved = diffeqsolve(
+        *(on_circle, dps.Suzuki4(dps.Strang()), 0.0, 4.0, None),
+        (jnp.array([1.0, 0.0]), jnp.zeros(2)),
+        stepsize_controller=dps.StepDensityController(0.2, lambda t, y, args: 1.0),
+        saveat=dfx.SaveAt(ts=jnp.linspace(0.1, 3.9, 20)),
+        adjoint=OWN,
+    )
+    assert solved.stats["interpolated"] == 0
+    np.testing.assert_allclose(jnp.sum(solved.ys[0] ** 2, axis=1), 1, 1e-13)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_gradients_where_some_values_are_shorter_steps(way):
+    """Alone, and in a batch of which one member takes none, and one no other."""
+    ts = jnp.linspace(0.1, 11.9, 47).at[jnp.array([3, 30])].set(jnp.nan)
+
+    def total(x):
+        rate, shift, size = x
+        y0 = size * START[0], START[1]
+        sol = damped(dps.LogDamping(rate, shift), ts, y0, WAYS[way])
+        ys = jnp.concatenate(sol.ys, axis=1)
+        weights = jnp.cos(jnp.arange(ys.size, dtype=float)).reshape(ys.shape)
+        loss = jnp.sum(jnp.where(jnp.isfinite(ys), ys, 0.0) * weights)
+        return loss, (ys, sol.stats["interpolated"])
+
+    run, value = jax.value_and_grad(total, has_aux=True), jax.jit(total)
+    members = jnp.array([[9.0, 1.0, 1.0], [0.5, 1.0, 0.8], [900.0, 80.0, 1.2]])
+    (_, (ys, number)), gradients = jax.jit(jax.vmap(run))(members)
+    assert number[1] == 45 and 0 < number[0] < 45 and number[2] == 0
+    for x, y, gradient in zip(members, ys, gradients, strict=True):
+        (_, (alone, _)), got = jax.jit(run)(x)
+        np.testing.assert_allclose(y, alone, 1e-11, 1e-12)
+        np.testing.assert_allclose(gradient, got, 1e-8, 1e-10)
+        for e in 1e-6 * jnp.eye(3):
+            two = (value(x + e)[0] - value(x - e)[0]) / 2e-6
+            assert got @ e / 1e-6 == pytest.approx(float(two), rel=1e-5, abs=1e-7)

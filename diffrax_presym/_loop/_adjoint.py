@@ -18,6 +18,7 @@ from ._backward import Backward
 from ._kept import Checkpoints, Reversal
 from ._one_function import as_one_function
 from ._problem import Problem
+from ._pull import pulls
 from ._run import run, saved_rows
 from ._steps import Steps, StepsBetween
 from ._variable import VariableSteps
@@ -139,11 +140,8 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
             (progress_meter, meter),
             reversal=isinstance(way, Reversal),
         )
-        final = _final_state(problem, way, init_state, structure)
-        about = {
-            "order": solver.order(terms),
-            "interpolated": problem.number_interpolated,
-        }
+        final, interpolated = _final_state(problem, way, init_state, structure)
+        about = {"order": solver.order(terms), "interpolated": interpolated}
         return final, about
 
     def _way(
@@ -239,11 +237,11 @@ def _final_state(problem: Problem, way: Reversal | Checkpoints, init_state, stru
     out = _solve((problem, buffers), way)
     out, counts = eqx.partition(out, eqx.is_inexact_array)
     # To JAX all outputs of a custom rule have derivatives, even integers.
-    end, saved, n, result, meter = eqx.combine(
+    end, saved, n, result, meter, interpolated = eqx.combine(
         out, eqxi.nondifferentiable_backward(counts)
     )
     carry, control = problem.steps.split(end[1])
-    return private.final_state(
+    final = private.final_state(
         init_state,
         structure,
         y=end[0],
@@ -255,6 +253,7 @@ def _final_state(problem: Problem, way: Reversal | Checkpoints, init_state, stru
         meter=meter,
         saved=saved,
     )
+    return final, interpolated
 
 
 @eqx.filter_custom_vjp
@@ -269,7 +268,8 @@ def _outputs(problem: Problem, buffers, out):
     (progress, result, values), trace = out
     each = zip(trace.rows, buffers, values, strict=True)
     saved = [saved_rows(problem, i, *x, progress) for i, x in enumerate(each)]
-    return progress.point, saved, progress.n, result, progress.meter
+    about = progress.meter, trace.interpolated
+    return progress.point, saved, progress.n, result, *about
 
 
 @_solve.def_fwd
@@ -298,7 +298,8 @@ def _solve_bwd(trace, bars, perturbed, inputs, way: Reversal | Checkpoints):
     saved_bars = [
         zeros(saved, bar[:2]) for saved, bar in zip(buffers, saved_bars, strict=True)
     ]
-    backward = Backward(problem, trace, perturbed[0].functions, saved_bars, carry_bar)
+    bars = saved_bars, carry_bar, pulls(problem)
+    backward = Backward(problem, trace, perturbed[0].functions, *bars)
     at = way.pull_back(backward)
     none = lambda tree: jtu.tree_map(lambda _: None, tree)
     where = lambda x: (x.functions, x.start)

@@ -15,13 +15,11 @@ from jaxtyping import Array, Int, PyTree
 from .. import _tree as tree
 from .._numbers import State
 from .._scheme._base import Point
-from ._nodes import NODES, Stencils
 from ._problem import Functions, Problem
 from ._run import end_is_separate, Trace
-from ._tracks import put, stack
 
 
-def _zeros(x: PyTree) -> PyTree:
+def zeros(x: PyTree) -> PyTree:
     """The cotangent zero, for which a `tree.Sum` is two arrays."""
     return jtu.tree_map(jnp.zeros_like, x)
 
@@ -33,7 +31,7 @@ class BackwardState(eqx.Module):
     point: Point
     bar: PyTree  # the cotangents of the state and the solver state
     gradient: PyTree  # the cotangents of the functions so far
-    tracks: list[PyTree]  # the states of `Backward.tracks`
+    tracks: list[PyTree]  # the states of those of `Backward`
     # The end of the last step, as the backward pass came to it, and from its start.
     ends: tuple[State, State]
 
@@ -48,13 +46,15 @@ Start = Callable[[Array, Point], Point]
 
 
 class Backward(eqx.Module):
-    """The backward pass through a solve, step by step."""
+    """The backward pass through a solve, step by step, and through what its tracks
+    collected."""
 
     problem: Problem
     trace: Trace
     wanted: PyTree  # the differentiated leaves of the functions
     saved_bars: list[PyTree]  # the cotangents of the times and values of each output
     carry_bar: PyTree
+    tracks: list["AbstractPull"]
 
     @property
     def _functions(self) -> tuple[PyTree, PyTree]:
@@ -76,8 +76,8 @@ class Backward(eqx.Module):
         at = BackwardState(
             n,
             point,
-            (_zeros(point[0]), self.carry_bar),
-            _zeros(self._functions[0]),
+            (zeros(point[0]), self.carry_bar),
+            zeros(self._functions[0]),
             [track.start(self) for track in self.tracks],
             (point[0], point[0]),
         )
@@ -88,16 +88,6 @@ class Backward(eqx.Module):
                 row = self.row(i, last, separate)
                 at = at.add(*self._pull_point(i, n, point, row))
         return at
-
-    @property
-    def tracks(self) -> list["AbstractPull"]:
-        problem, tracks = self.problem, []
-        for i, (rows, stencils) in enumerate(
-            zip(problem.rows, problem.stencils, strict=True)
-        ):
-            tracks += [PullRows(i, rows.stop)] if len(rows) else []
-            tracks += [] if stencils is None else [PullNodes(i, stencils)]
-        return tracks
 
     def start(self, at: BackwardState) -> BackwardState:
         """Pull back the outputs of `t0`."""
@@ -190,104 +180,3 @@ class AbstractPull(eqx.Module):
         self, backward: Backward, at: BackwardState, state: PyTree
     ) -> tuple[BackwardState, PyTree]:
         """Pull back what is due."""
-
-
-class PullRows(AbstractPull):
-    """Values at steps, or of shorter ones from there; the state is their number."""
-
-    stops: Array
-
-    def start(self, backward):
-        problem, i = backward.problem, self.i
-        number = jnp.sum(problem.rows[i].reached(backward.trace.n))
-        stencils = problem.stencils[i]
-        return number if stencils is None else jnp.minimum(number, stencils.latest)
-
-    def due(self, state, n):
-        stop = self.stops[state - 1]
-        return jnp.where(state > 0, jnp.where(stop < 0, n, stop), -1)
-
-    def pull(self, backward, at, state):
-        i, j, problem = self.i, state - 1, backward.problem
-        rows = problem.rows[i]
-        taken = rows.stop[j] >= 0
-        if (stencils := problem.stencils[i]) is not None:
-            taken &= j < stencils.begin
-        bar = backward.row(i, int(problem.subs[i].t0) + j, taken)
-
-        def pull(shorter: bool):
-            def output(functions: Functions, start: Point):
-                return problem.output(i, functions, j, start, shorter)[:2]
-
-            return backward.pull(output, bar, at.point)
-
-        if not rows.may_be_inside:
-            return at.add(*pull(False)), j
-        # Decided before the derivative is taken: in a batch, JAX would differentiate
-        # the branch that is not taken at zeros, where an implicit step is singular.
-        pulled = lax.cond(rows.inside[j], lambda: pull(True), lambda: pull(False))
-        return at.add(*pulled), j
-
-
-class PullNodes(AbstractPull):
-    """Values between steps, by the cotangents of the last few nodes."""
-
-    stencils: Stencils
-
-    def start(self, backward):
-        n, node = backward.trace.n, stack(backward.trace.end[0], 3)
-        # The first that is not known.
-        number = jnp.argmax(self.stencils.last(slice(None)) > n)
-        return n + 1, n + 1, number, _zeros(stack(node, NODES))
-
-    def due(self, state, n):
-        node, low, j, _ = state
-        last = self.stencils.last(j - 1)
-        row = jnp.where(last < 0, n, last)
-        row = jnp.where(j > self.stencils.earliest, row, -1)
-        return jnp.where(node > low, node - 1, row)
-
-    def pull(self, backward, at, state):
-        problem, i, n = backward.problem, self.i, at.n
-        rows, start = problem.rows[i], problem.start[0]
-
-        def spread(x):
-            gradient, low, j, bars = x
-            j = j - 1
-            taken = (rows.stop[j] >= 0) & (j >= self.stencils.begin)
-            _, bar = backward.row(i, int(problem.subs[i].t0) + j, taken)
-            # Of the others nothing may fail of which a gradient takes zero times.
-            time = jnp.where(taken, rows.time[j], problem.steps.t0)
-            y = jtu.tree_map(lambda x: x[j], backward.trace.between[i])
-            y = tree.where(taken, y, start)
-            output = lambda functions, y: functions.outputs[i](time, y)
-            more, bar = backward.pull(output, bar, y)
-            bars = self.stencils.spread(j, bar, bars)
-            low = jnp.where(rows.stop[j] >= 0, self.stencils.first[j], low)
-            return tree.add(gradient, more), low, j, bars
-
-        def unspread(x):
-            last = self.stencils.last(x[2] - 1)
-            return (x[2] > self.stencils.earliest) & ((last < 0) | (last >= n))
-
-        def pull(side: Array, at: BackwardState, bars: PyTree):
-            node = lambda functions, point: functions.node(n, side, point)
-            bar = jtu.tree_map(lambda x: x[n % NODES], bars)
-            at = at.add(*backward.pull(node, bar, at.point))
-            return at, put(bars, n % NODES, _zeros(bar))
-
-        _, low, j, bars = state
-        kink, kinks = jnp.zeros((), int), problem.steps.kinks
-        if kinks is not None:
-            kink = jnp.any(kinks == n).astype(int)
-            after = lambda: pull(kink, at, bars)
-            at, bars = lax.cond(kink == 1, after, lambda: (at, bars))
-        gradient, low, j, bars = lax.while_loop(
-            unspread, spread, (at.gradient, low, j, bars)
-        )
-        at = eqx.tree_at(lambda at: at.gradient, at, gradient, is_leaf=_is_none)
-        at, bars = pull(-kink, at, bars)
-        return at, (n, low, j, bars)
-
-
-_is_none = lambda x: x is None

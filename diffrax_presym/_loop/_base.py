@@ -2,10 +2,11 @@
 
 import abc
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._numbers import Scalar, State
@@ -14,6 +15,9 @@ from .._scheme._engine import Result, Span
 from .._system._bound import System
 
 
+# The largest friction over a step that polynomials are to follow. With more the motion
+# decays, or turns, too fast.
+MOST_FRICTION = 0.5
 # More than any solve takes, in integers of either precision.
 MOST_STEPS = 2**30
 
@@ -24,6 +28,16 @@ class Stop(NamedTuple):
 
     n: Int[Array, ""]
     time: Float[Array, ""] | None = None
+
+
+def follows(system: System, t0: Array, h: Array) -> Any:
+    """Whether polynomials can follow the motion over a step: the logarithm of a decay,
+    or half of the angle of a rotation, is small."""
+    friction, start, h = system.friction, jnp.minimum(t0, t0 + h), jnp.abs(h)
+    if friction is None:
+        return True
+    most = jnp.maximum(friction.growth(start, h), friction.angle(h))
+    return most <= MOST_FRICTION
 
 
 class AbstractSteps(eqx.Module):

@@ -5,6 +5,7 @@ time, the nodes, and their first two derivatives along the motion.
 """
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -18,32 +19,33 @@ from .. import _tree as tree
 from .._numbers import cast_to, State
 from .._scheme._base import Point, Scheme
 from .._system._bound import System
-from ._base import MOST_STEPS
+from ._base import MOST_FRICTION, MOST_STEPS
 from ._rows import Rows
 from ._steps import Steps
 
 
 NODES = 4  # of a polynomial
-# The largest friction over a step. With more the motion decays, or turns, faster than
-# the polynomial can follow.
-_MOST_FRICTION = 0.5
 # The largest ratio of neighbouring steps.
 _MOST_RATIO = 2.0
 
 # Power iterations for the rate of friction that depends on the state.
 _ITERATIONS = 8
 
-# A state and its first two derivatives, stacked: as few arrays as possible, because
+# A state and its first derivatives, stacked: as few arrays as possible, because
 # XLA runs many independent operations on a CPU by several threads, which takes longer.
 Node = State
 
 
 def derivatives(
-    scheme: Scheme, system: System, t: Array, h: Array, side: Array, point: Point
+    scheme: Scheme,
+    system: System,
+    t: Array,
+    point: Point,
+    number: int,
+    moment: Array | None = None,
 ) -> Node:
-    """The state at a time of the solve, and its first two derivatives in that time:
-    where they jump, those before it (-1) or after it (1); of a step of length `h`."""
-    t = jnp.nextafter(t, t + cast_to(side, t))
+    """The state at a time of the solve, and so many derivatives in that time, all but
+    the first of a moment later."""
     y, force = system.values(point[0]), scheme.end_force(point[1])
 
     def slope(t: Array, y: State, force: PyTree = None) -> State:
@@ -52,11 +54,30 @@ def derivatives(
 
     first, known = slope(t, y, force), y
     along = jnp.ones_like(t), first
+    if moment is not None:
+        t, y = t + cast_to(moment, t), tree.add_scaled(y, moment, first)
+    later, rate = [], slope
+    for _ in range(number - 1):
+        later.append(jax.jvp(rate, (t, y), along)[1])
+        rate = _rate_of(rate, slope)
+    return jtu.tree_map(lambda *x: jnp.stack(x), known, first, *later)
+
+
+def _rate_of(fn: Callable, slope: Callable) -> Callable:
+    """The derivative of `fn(t, y)` along the motion."""
+    return lambda t, y: jax.jvp(fn, (t, y), (jnp.ones_like(t), slope(t, y)))[1]
+
+
+def node(
+    scheme: Scheme, system: System, steps: Steps, n: Array, side: Array, point: Point
+) -> Node:
+    """The state at the start of a step, and its first two derivatives: where they jump,
+    those before it (-1) or after it (1)."""
+    t, h, moment = steps.time(n), steps.lengths(n), None
+    t = jnp.nextafter(t, t + cast_to(side, t))
     if system.external is not None:
         moment = _moment(jnp.where(side < 0, -h, h))
-        t, y = t + cast_to(moment, t), tree.add_scaled(y, moment, first)
-    second = jax.jvp(slope, (t, y), along)[1]
-    return jtu.tree_map(lambda *x: jnp.stack(x), known, first, second)
+    return derivatives(scheme, system, t, point, 2, moment)
 
 
 def _moment(h: Array) -> Array:
@@ -94,11 +115,11 @@ def first_node(system: System, steps: Steps, last: Array, y: State) -> Int[Array
     yes &= steps.ratio <= _MOST_RATIO
     first = jnp.zeros((), int)
     if system.friction is not None:
-        first = steps.weak_from(system, last, _MOST_FRICTION)
+        first = steps.weak_from(system, last)
     if system.has_unknown_friction:
         h = steps.longest
         most = jnp.abs(h) * _rate(system, system.time(steps.t0), y, h) / 2
-        yes &= most <= _MOST_FRICTION
+        yes &= most <= MOST_FRICTION
     return lax.stop_gradient(jnp.where(yes, first, MOST_STEPS))
 
 

@@ -6,7 +6,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, PyTree
+from jaxtyping import Array, Bool, Int, PyTree
 
 from .. import _tree as tree
 from .._numbers import Scalar, State
@@ -15,9 +15,11 @@ from .._scheme._base import AbstractPresymplecticSolver, Point
 from .._scheme._engine import Result
 from .._system._bound import System
 from ._base import AbstractSteps
-from ._nodes import derivatives, first_node, Node, Stencils
+from ._nodes import first_node, Node, node, Stencils
 from ._rows import Rows
 from ._steps import Steps
+from ._variable import VariableSteps
+from ._within import End, end_of_step
 
 
 class Functions(eqx.Module):
@@ -33,6 +35,9 @@ class Functions(eqx.Module):
     # The state at the start of a step and its first two derivatives, if used, on a
     # side of it.
     node: Callable[[Array, Array, Point], Node] | None
+    # The same of a step that varies, with its time, and whether a polynomial can follow
+    # the motion within it.
+    end: Callable[[Array, Point], tuple[End, Bool[Array, ""]]] | None
     outputs: list[Callable[[Array, State], PyTree]]  # of `SaveAt(fn=...)`
 
 
@@ -82,13 +87,11 @@ class Problem(eqx.Module):
         # Where steps end is differentiated as part of the functions.
         self.steps, self.max_steps = steps.without_gradient(), max_steps
         self.stencils = [None] * len(self.rows)
-        at_node = None
+        at_node = at_end = None
         resolved = scheme.is_resolved and solver.order(None) > 2
         if isinstance(steps, Steps) and some and resolved:
             at_node = convert(
-                lambda n, side, point: derivatives(
-                    *(scheme, system, steps.time(n), steps.lengths(n), side, point)
-                ),
+                lambda n, side, point: node(scheme, system, steps, n, side, point),
                 *(n, n, start),
             )
             first = first_node(system, steps, self.last, start[0])
@@ -97,13 +100,19 @@ class Problem(eqx.Module):
                     stencils = Stencils(steps, rows, self.last, first)
                     self.stencils[i] = stencils
                     self.rows[i] = rows.known_after(stencils.known(rows))
+        known = resolved and not system.has_unknown_friction
+        if isinstance(steps, VariableSteps) and some and known:
+            end = lambda n, point: end_of_step(scheme, system, steps, n, point)
+            at_end = convert(end, n, start)
+            some = system.friction is not None
 
         outputs = [
             convert(lambda t, y, fn=sub.fn: fn(t, y, system.args), t0, start[0])
             for sub in subs
         ]
         within = convert(shorter, n, start, t0) if some else None
-        self.functions = Functions(convert(step, n, start), within, at_node, outputs)
+        several = within, at_node, at_end, outputs
+        self.functions = Functions(convert(step, n, start), *several)
         self.start = start
         # Computed, so that it has the sharding of others within `jax.shard_map`.
         result = dfx.RESULTS.where(n < 0, NONFINITE, dfx.RESULTS.successful)
@@ -166,14 +175,12 @@ class Problem(eqx.Module):
         j: Array,
         start: Point,
         shorter: bool | None = None,
-        found: tuple[Array, Array] | None = None,
     ) -> tuple[Array, PyTree, Array]:
         """The time and the value that output `i` saves in row `j`, from the state at
-        the start of its step, and whether that is finite. Which step it is, and whether
-        the row is inside of it, is `found` if the steps are not known beforehand."""
+        the start of its step, and whether that is finite."""
         rows, y = self.rows[i], start[0]
-        n, inside = (rows.stop[j], rows.inside[j]) if found is None else found
+        n, inside = rows.stop[j], rows.inside[j]
         time = rows.time[j] if rows.has_times else self.steps.begin(n, start)
-        if rows.may_be_inside:
+        if rows.may_be_inside and functions.shorter is not None:
             y = self.between(functions, n, start, time, inside, shorter)
         return time, functions.outputs[i](time, y), tree.all_finite(y)

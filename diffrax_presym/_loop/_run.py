@@ -25,7 +25,8 @@ from ._base import MOST_STEPS, Stop
 from ._problem import Problem
 from ._rows import Rows
 from ._tracks import AbstractTrack, Between, put, stops_due, Track
-from ._variable import Timed
+from ._variable import VariableSteps
+from ._within import Timed
 
 
 # The steps of a loop whose length is known, for which the host does not wait on a GPU.
@@ -51,6 +52,7 @@ class Trace(eqx.Module):
     kept: PyTree  # the steps whose starting states are kept, and these
     before: Point | None  # as in `Progress`
     rows: list[Rows]  # of which the steps are known now
+    interpolated: Int[Array, ""]  # how many of these a polynomial followed
 
 
 def run(problem: Problem, kept: AbstractTrack | None = None):
@@ -62,7 +64,7 @@ def run(problem: Problem, kept: AbstractTrack | None = None):
     progress = eqx.tree_at(lambda x: x.n, end, n)
 
     saved, between, finite = [], [], tree.all_finite(progress.point[0])
-    all_rows = []
+    all_rows, interpolated = [], problem.number_interpolated
     for i, collected in enumerate(stacked):
         values, ys, rows = None, None, problem.rows[i]
         if problem.stencils[i] is not None:
@@ -73,8 +75,10 @@ def run(problem: Problem, kept: AbstractTrack | None = None):
                 time, *collected = collected
                 rows = rows.at(time)
             elif not problem.steps.are_known:
-                found, collected = collected
-                rows = rows.found(*found)
+                found, *collected, kept_row = collected
+                rows = rows.found(found.step, found.inside)
+                ys = found.interpolated, kept_row
+                interpolated += jnp.sum(rows.taken(progress.n) & found.interpolated)
             values, each = collected
             finite &= jnp.all(each | ~rows.taken(progress.n))
         saved.append(values)
@@ -88,7 +92,8 @@ def run(problem: Problem, kept: AbstractTrack | None = None):
     ended = problem.steps.ended(progress.n, progress.point)
     short = (result == success) & ~ended
     result = dfx.RESULTS.where(short, dfx.RESULTS.max_steps_reached, result)
-    trace = Trace(end.n, end.point, between, kept_states, end.before, all_rows)
+    about = all_rows, interpolated
+    trace = Trace(end.n, end.point, between, kept_states, end.before, *about)
     return (progress, result, saved), trace
 
 
@@ -106,9 +111,12 @@ def _track(problem: Problem, i: int, keep: bool) -> AbstractTrack | None:
     stops = stops_due(rows.stop, due, problem.last + 1)
     if not rows.has_times:
         return Track(stops, saved, (problem.steps.t0, init, jnp.asarray(True)))
-    if not problem.steps.are_known:
-        found = lambda j, n, inside, point: saved(j, point, found=(n, inside))[1:]
-        return Timed(rows.time, found, (init, jnp.asarray(True)))
+    if isinstance(problem.steps, VariableSteps):
+        shorter = None
+        if functions.shorter is not None:
+            shorter = partial(problem.between, functions)
+        how = functions.end, shorter, output, keep
+        return Timed(problem.steps, rows.time, *how, y, init)
     if stencils is None:
         value = lambda j, point: saved(j, point)[1:]
         return Track(stops, value, (init, jnp.asarray(True)))

@@ -17,7 +17,7 @@ from .._scheme._base import advance, Scheme
 from .._scheme._engine import backward, is_autonomous, prepare, prepare_once, Span
 from .._scheme._failure import explain, unless_too_strong
 from .._system._bound import System
-from ._base import AbstractSteps, MOST_STEPS, Stop
+from ._base import AbstractSteps, follows, MOST_STEPS, Stop
 
 
 _OTHER_ENDS = (
@@ -205,17 +205,14 @@ class Steps(AbstractSteps):
     def longest(self) -> Float[Array, ""]:
         return jnp.max(self.length if self.ts is None else jnp.diff(self.ts))
 
-    def weak_from(self, system: System, last: Array, most: float) -> Int[Array, ""]:
-        """The first step from which on there is at most so much friction over each: the
-        logarithm of a decay, or half of the angle of a rotation."""
+    def weak_from(self, system: System, last: Array) -> Int[Array, ""]:
+        """The first step from which on polynomials can follow the motion."""
         friction = system.friction
         assert friction is not None
 
         def after(n: Array, first: Array) -> Array:
-            t0, t1, h = self.span(system, n)
-            start, h = jnp.minimum(t0, t1), jnp.abs(h)
-            weak = jnp.maximum(friction.growth(start, h), friction.angle(h)) <= most
-            return jnp.where(weak, first, n + 1)
+            t0, _, h = self.span(system, n)
+            return jnp.where(follows(system, t0, h), first, n + 1)
 
         zero = jnp.zeros((), int)
         if self.are_equal and friction.is_autonomous:

@@ -5,7 +5,6 @@ as one of a length that is known, and is undone and differentiated like it: with
 dependence of all steps on the states before them.
 """
 
-from collections.abc import Callable
 from functools import reduce
 from typing import ClassVar, NamedTuple
 
@@ -20,7 +19,7 @@ from .._scheme._base import advance, check_step, Point
 from .._scheme._engine import backward, first_failure, prepare, Span
 from .._step_size._density import StepDensityController
 from ._base import AbstractSteps, MOST_STEPS, Stop
-from ._tracks import AbstractTrack, put, put_here, stack, where_any
+from ._tracks import AbstractTrack, put, stack, where_any
 
 
 class Clock(NamedTuple):
@@ -57,6 +56,9 @@ class VariableSteps(AbstractSteps):
     def _clock(self, point: Point) -> Clock:
         return point[1][1]
 
+    def time(self, point: Point) -> tree.Sum:
+        return self._clock(point).t
+
     def begin(self, n, point):
         return self._clock(point).t.value
 
@@ -88,9 +90,9 @@ class VariableSteps(AbstractSteps):
 
     def at(self, stop, n, point):
         here = n == stop.n
-        return here if stop.time is None else here | self._within(stop.time, n, point)
+        return here if stop.time is None else here | self.is_within(stop.time, n, point)
 
-    def _within(self, time: Array, n: Array, point: Point) -> Bool[Array, ""]:
+    def is_within(self, time: Array, n: Array, point: Point) -> Bool[Array, ""]:
         """Whether a time is before the end of the next step."""
         last = self.ended(n, point) & (time <= self.t1)
         return (time < self.end(n, point)) | last
@@ -101,7 +103,7 @@ class VariableSteps(AbstractSteps):
     def is_left(self, stop, last, n, point):
         if stop.time is None:
             return jnp.asarray(False)
-        return self._within(stop.time, n, point)
+        return self.is_within(stop.time, n, point)
 
     def join(self, carry, control):
         return carry, Clock(_exact(self.t0), control)
@@ -147,41 +149,6 @@ class VariableSteps(AbstractSteps):
     def without_gradient(self):
         fixed = tree.stop_gradient(self.controller)
         return eqx.tree_at(lambda x: x.controller, self, fixed)
-
-
-class Timed(AbstractTrack):
-    """Values at given times, wherever these are in the steps."""
-
-    times: Float[Array, " rows"]
-    # Of the row, the number and the start of its step, and whether it is inside of it.
-    value: Callable[[Array, Array, Array, Point], PyTree]
-    init: PyTree
-
-    def start(self):
-        number = len(self.times)
-        found = jnp.full(number, MOST_STEPS), jnp.ones(number, bool)
-        return jnp.zeros((), int), found, stack(self.init, number)
-
-    def due(self, state):
-        j, *_ = state
-        t = self.times[jnp.minimum(j, len(self.times) - 1)]
-        # At once if that is a gap in measured times.
-        t = jnp.where(jnp.isnan(t), -jnp.inf, t)
-        left = j < len(self.times)
-        return Stop(jnp.asarray(MOST_STEPS), jnp.where(left, t, jnp.inf))
-
-    def visit(self, state, n, point, here):
-        def save(state):
-            j, found, rows = state
-            inside = self.times[j] > point[1][1].t.value
-            value = (n, inside), self.value(j, n, inside, point)
-            rows = put_here((found, rows), j, value, here)
-            return j + jnp.asarray(here, j.dtype), *rows
-
-        return where_any(here, save, state)
-
-    def rows(self, state):
-        return state[1:]
 
 
 class Kept(AbstractTrack):

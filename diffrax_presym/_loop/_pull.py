@@ -1,0 +1,211 @@
+"""How what was saved of a solve is pulled back."""
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Int, PyTree
+
+from .. import _tree as tree
+from .._numbers import cast_to
+from .._scheme._base import Point
+from ._backward import AbstractPull, Backward, BackwardState, zeros
+from ._nodes import NODES, Stencils
+from ._problem import Functions, Problem
+from ._tracks import put, stack
+from ._within import DERIVATIVES, End
+
+
+def pulls(problem: Problem) -> list[AbstractPull]:
+    """How each output is pulled back."""
+    tracks = []
+    for i, (rows, stencils) in enumerate(
+        zip(problem.rows, problem.stencils, strict=True)
+    ):
+        varies = rows.may_be_inside and problem.functions.end is not None
+        if varies:
+            tracks.append(PullTimed(i, rows.stop))
+        elif len(rows):
+            tracks.append(PullRows(i, rows.stop))
+        if stencils is not None:
+            tracks.append(PullNodes(i, stencils))
+    return tracks
+
+
+class PullRows(AbstractPull):
+    """Values at steps, or of shorter ones from there; the state is their number."""
+
+    stops: Array
+
+    def start(self, backward):
+        problem, i = backward.problem, self.i
+        number = jnp.sum(problem.rows[i].reached(backward.trace.n))
+        stencils = problem.stencils[i]
+        return number if stencils is None else jnp.minimum(number, stencils.latest)
+
+    def due(self, state, n):
+        stop = self.stops[state - 1]
+        return jnp.where(state > 0, jnp.where(stop < 0, n, stop), -1)
+
+    def pull(self, backward, at, state):
+        j, problem = state - 1, backward.problem
+        taken = problem.rows[self.i].stop[j] >= 0
+        if (stencils := problem.stencils[self.i]) is not None:
+            taken &= j < stencils.begin
+        return _pull_row(backward, at, self.i, j, taken), j
+
+
+def _pull_row(
+    backward: Backward, at: BackwardState, i: int, j: Array, taken: Array
+) -> BackwardState:
+    """Pull back a value at a step, or by a shorter one from there."""
+    problem = backward.problem
+    rows, bar = problem.rows[i], backward.row(i, int(problem.subs[i].t0) + j, taken)
+
+    def pull(shorter: bool):
+        def output(functions: Functions, start: Point):
+            return problem.output(i, functions, j, start, shorter)[:2]
+
+        return backward.pull(output, bar, at.point)
+
+    if not rows.may_be_inside or problem.functions.shorter is None:
+        return at.add(*pull(False))
+    # Decided before the derivative is taken: in a batch, JAX would differentiate the
+    # branch that is not taken at zeros, where an implicit step is singular.
+    return at.add(*lax.cond(rows.inside[j], lambda: pull(True), lambda: pull(False)))
+
+
+class PullNodes(AbstractPull):
+    """Values between steps, by the cotangents of the last few nodes."""
+
+    stencils: Stencils
+
+    def start(self, backward):
+        n, node = backward.trace.n, stack(backward.trace.end[0], 3)
+        # The first that is not known.
+        number = jnp.argmax(self.stencils.last(slice(None)) > n)
+        return n + 1, n + 1, number, zeros(stack(node, NODES))
+
+    def due(self, state, n):
+        node, low, j, _ = state
+        last = self.stencils.last(j - 1)
+        row = jnp.where(last < 0, n, last)
+        row = jnp.where(j > self.stencils.earliest, row, -1)
+        return jnp.where(node > low, node - 1, row)
+
+    def pull(self, backward, at, state):
+        problem, i, n = backward.problem, self.i, at.n
+        rows, start = problem.rows[i], problem.start[0]
+
+        def spread(x):
+            gradient, low, j, bars = x
+            j = j - 1
+            taken = (rows.stop[j] >= 0) & (j >= self.stencils.begin)
+            _, bar = backward.row(i, int(problem.subs[i].t0) + j, taken)
+            # Of the others nothing may fail of which a gradient takes zero times.
+            time = jnp.where(taken, rows.time[j], problem.steps.t0)
+            y = jtu.tree_map(lambda x: x[j], backward.trace.between[i])
+            y = tree.where(taken, y, start)
+            output = lambda functions, y: functions.outputs[i](time, y)
+            more, bar = backward.pull(output, bar, y)
+            bars = self.stencils.spread(j, bar, bars)
+            low = jnp.where(rows.stop[j] >= 0, self.stencils.first[j], low)
+            return tree.add(gradient, more), low, j, bars
+
+        def unspread(x):
+            last = self.stencils.last(x[2] - 1)
+            return (x[2] > self.stencils.earliest) & ((last < 0) | (last >= n))
+
+        def pull(side: Array, at: BackwardState, bars: PyTree):
+            node = lambda functions, point: functions.node(n, side, point)
+            bar = jtu.tree_map(lambda x: x[n % NODES], bars)
+            at = at.add(*backward.pull(node, bar, at.point))
+            return at, put(bars, n % NODES, zeros(bar))
+
+        _, low, j, bars = state
+        kink, kinks = jnp.zeros((), int), problem.steps.kinks
+        if kinks is not None:
+            kink = jnp.any(kinks == n).astype(int)
+            after = lambda: pull(kink, at, bars)
+            at, bars = lax.cond(kink == 1, after, lambda: (at, bars))
+        gradient, low, j, bars = lax.while_loop(
+            unspread, spread, (at.gradient, low, j, bars)
+        )
+        at = eqx.tree_at(lambda at: at.gradient, at, gradient, is_leaf=_is_none)
+        at, bars = pull(-kink, at, bars)
+        return at, (n, low, j, bars)
+
+
+class PullTimed(AbstractPull):
+    """Values within steps that vary, by the cotangents of the ends of these."""
+
+    stops: Int[Array, " rows"]
+
+    def start(self, backward):
+        trace, t0 = backward.trace, backward.problem.steps.t0
+        number = jnp.sum(backward.problem.rows[self.i].reached(trace.n))
+        node = zeros(stack(stack(trace.end[0], DERIVATIVES + 1), 2))
+        bars = stack(jnp.zeros_like(t0), 2), node
+        return trace.n + 1, trace.n + 1, number, bars
+
+    def due(self, state, n):
+        node, low, j, _ = state
+        stop = self.stops[j - 1]
+        row = jnp.where(j > 0, jnp.where(stop < 0, n, stop), -1)
+        return jnp.where(node > low, node - 1, row)
+
+    def pull(self, backward, at, state):
+        problem, i, n = backward.problem, self.i, at.n
+        rows, start = problem.rows[i], problem.start[0]
+        interpolated, kept = backward.trace.between[i]
+        place = (jnp.arange(2) - (n - 1)) % 2
+
+        def spread(x):
+            at, low, j, bars = x
+            j = j - 1
+            own = (rows.stop[j] >= 0) & interpolated[j]
+
+            def between():
+                _, bar = backward.row(i, int(problem.subs[i].t0) + j, own)
+                # Of the others nothing may fail of which a gradient takes zero times.
+                time = jnp.where(own, rows.time[j], problem.steps.t0)
+                row = jtu.tree_map(lambda x: x[j], kept)
+                y = tree.where(own, row.y, start)
+                output = lambda functions, y: functions.outputs[i](time, y)
+                more, bar = backward.pull(output, bar, y)
+                times = cast_to(jax.vmap(lambda x: tree.dot(bar, x))(row.by_time), time)
+                weights = row.weights[place]
+
+                def leaf(x: Array, bar: Array) -> Array:
+                    each = jnp.expand_dims(cast_to(weights, bar), range(2, x.ndim))
+                    return x + each * bar[None, None]
+
+                new = bars[0] + times[place], jtu.tree_map(leaf, bars[1], bar)
+                return at.add(more, zeros(at.bar)), rows.stop[j] - 1, new
+
+            def other():
+                taken = (rows.stop[j] >= 0) & ~own
+                return _pull_row(backward, at, i, j, taken), low, bars
+
+            at, low, bars = lax.cond(own, between, other)
+            return at, low, j, bars
+
+        def unspread(x):
+            stop = self.stops[x[2] - 1]
+            return (x[2] > 0) & ((stop < 0) | (stop >= n))
+
+        def pull(at: BackwardState, bars: PyTree):
+            end = lambda functions, point: functions.end(n, point)[0]
+            time, node = jtu.tree_map(lambda x: x[n % 2], bars)
+            bar = End(tree.Sum(time, time), node)
+            at = at.add(*backward.pull(end, bar, at.point))
+            return at, put(bars, n % 2, zeros((time, node)))
+
+        _, low, j, bars = state
+        at, low, j, bars = lax.while_loop(unspread, spread, (at, low, j, bars))
+        at, bars = lax.cond(low <= n, lambda: pull(at, bars), lambda: (at, bars))
+        return at, (n, low, j, bars)
+
+
+_is_none = lambda x: x is None

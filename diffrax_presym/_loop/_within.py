@@ -1,0 +1,201 @@
+"""Values within steps that a controller finds on the way.
+
+Hermite interpolation of degree 7, from the states at the two ends of the step and their
+first three derivatives along the motion: unlike that over several steps, as accurate as
+these where their lengths change fast.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from .. import _tree as tree
+from .._numbers import cast_to, State
+from .._scheme._base import Point, Scheme
+from .._system._bound import System
+from ._base import follows, MOST_STEPS, Stop
+from ._nodes import derivatives, Node
+from ._tracks import AbstractTrack, put_here, stack, where_any
+from ._variable import VariableSteps
+
+
+DERIVATIVES = 3
+
+
+class End(NamedTuple):
+    """An end of steps: its time, and the state there with its derivatives."""
+
+    time: tree.Sum
+    node: Node
+
+
+def end_of_step(
+    scheme: Scheme, system: System, steps: VariableSteps, n: Array, point: Point
+) -> tuple[End, Bool[Array, ""]]:
+    """The start of a step, and whether a polynomial can follow the motion within it."""
+    y, solver_state = point
+    carry, _ = steps.split(solver_state)
+    begin, h = steps.begin(n, point), steps.end(n, point) - steps.begin(n, point)
+    node = derivatives(scheme, system, begin, (y, carry), DERIVATIVES)
+    h = cast_to(system.direction, h) * h
+    smooth = follows(system, system.time(begin), h)
+    return End(steps.time(point), node), jnp.asarray(smooth)
+
+
+def _weights(s: Array, h: Array) -> Float[Array, "2 4"]:
+    """Of the value and the derivatives at both ends of a step of length `h`."""
+    unit = jnp.stack([h**k for k in range(DERIVATIVES + 1)])
+    mirrored = jnp.stack([(-h) ** k for k in range(DERIVATIVES + 1)])
+    return jnp.stack([unit * _at_zero(s), mirrored * _at_zero(1 - s)])
+
+
+def _at_zero(s: Array) -> Float[Array, "4"]:
+    """The polynomials of which one derivative at 0 is 1, and the other ones there, and
+    all at 1, are 0."""
+    n = DERIVATIVES
+    series = [math.comb(n + m, n) * s**m for m in range(n + 1)]
+    each = [s**k / math.factorial(k) * sum(series[: n + 1 - k]) for k in range(n + 1)]
+    return (1 - s) ** (n + 1) * jnp.stack(each)
+
+
+def _combine(weights: Float[Array, "4"], node: Node) -> State:
+    def leaf(x: Array) -> Array:
+        each = jnp.expand_dims(cast_to(weights, x), range(1, x.ndim))
+        return jnp.sum(each * x, axis=0)
+
+    return jtu.tree_map(leaf, node)
+
+
+class Found(NamedTuple):
+    """What is known of a row only when the solve comes to it."""
+
+    step: Int[Array, "..."]  # from whose start it is computed
+    inside: Bool[Array, "..."]  # by a shorter step from there
+    interpolated: Bool[Array, "..."]  # between that and the start of the step before
+
+
+class KeptRow(NamedTuple):
+    """What a gradient needs of an interpolated row."""
+
+    weights: Float[Array, "2 4"]
+    y: State
+    by_time: State  # its derivatives by the times of both ends, stacked
+
+
+class _Collected(NamedTuple):
+    j: Int[Array, ""]  # the next row
+    next: Int[Array, ""]  # the end of the step it is in, if it is interpolated there
+    ends: tuple[End, End]  # the last two
+    smooth: Bool[Array, ""]
+    rows: PyTree
+
+
+class Timed(AbstractTrack):
+    """Values at given times, wherever these are in the steps."""
+
+    steps: VariableSteps
+    times: Float[Array, " rows"]
+    # `None` if all values within steps are shorter steps.
+    end: Callable[[Array, Point], tuple[End, Bool[Array, ""]]] | None
+    # At a time `inside` of a step, or at its start; `None` if all are interpolated.
+    shorter: Callable[[Array, Point, Array, Array], State] | None
+    output: Callable[[Array, State], PyTree]
+    keep: bool = eqx.field(static=True)
+    y: State  # any
+    init: PyTree  # a value
+
+    def start(self):
+        zero, no, t = jnp.zeros((), int), jnp.zeros((), bool), self.steps.t0
+        node, time = stack(self.y, DERIVATIVES + 1), tree.Sum(t, jnp.zeros_like(t))
+        ends, kept = (End(time, node), End(time, node)), None
+        if self.keep and self.end is not None:
+            weights = jnp.zeros((2, DERIVATIVES + 1), t.dtype)
+            kept = KeptRow(weights, self.y, stack(self.y, 2))
+        row = Found(zero + MOST_STEPS, ~no, no), self.init, ~no, kept
+        rows = stack(row, len(self.times))
+        return _Collected(zero, zero + MOST_STEPS, ends, no, rows)
+
+    def _time(self, j: Array) -> Array:
+        # At once if that is a gap in measured times; after the last row never.
+        t = self.times[jnp.minimum(j, len(self.times) - 1)]
+        t = jnp.where(jnp.isnan(t), -jnp.inf, t)
+        return jnp.where(j < len(self.times), t, jnp.inf)
+
+    def due(self, state):
+        waits = state.next < MOST_STEPS
+        return Stop(state.next, jnp.where(waits, jnp.inf, self._time(state.j)))
+
+    def visit(self, state, n, point, here):
+        if (end := self.end) is not None:
+            # Apart from the rows: where all arrays are small, XLA does one operation
+            # after another on a CPU, and otherwise several at once, by threads, which
+            # takes longer.
+            last = state.ends[1], state.smooth
+            new, smooth = where_any(here, lambda _: end(n, point), last)
+            ends = tree.where(here, (state.ends[1], new), state.ends)
+            state = state._replace(ends=ends, smooth=smooth)
+        go = lambda state: self._visit(state, n, point, here)
+        return where_any(here, go, state)
+
+    def _visit(
+        self, state: _Collected, n: Array, point: Point, here: Array
+    ) -> _Collected:
+        now, ends, smooth = self.steps.begin(n, point), state.ends, state.smooth
+        within = lambda j: here & self.steps.is_within(self._time(j), n, point)
+        waits = lambda j: within(j) & smooth & (self._time(j) > now)
+        ready = lambda j: within(j) & ~waits(j)
+
+        def save(x: tuple[Array, PyTree]) -> tuple[Array, PyTree]:
+            j, rows = x
+            own, t, kept = ready(j), self._time(j), None
+            inside, past = t > now, (t < now) & (state.next == n)
+            y = point[0]
+            if (shorter := self.shorter) is not None:
+                time = jnp.where(inside, t, now)
+                some = lambda: shorter(n, point, time, inside)
+                y = lax.cond(tree.any_member(inside & own), some, lambda: point[0])
+            if self.end is not None:
+                between, kept = self._interpolate(t, past, ends)
+                y = tree.where(past, between, y)
+            value = self.output(self.times[j], y)
+            row = Found(n, inside, past), value, tree.all_finite(y), kept
+            return j + own.astype(j.dtype), put_here(rows, j, row, own)
+
+        more = lambda x: tree.any_member(ready(x[0]))
+        j, rows = lax.while_loop(more, save, (state.j, state.rows))
+        due = jnp.where(waits(j), n + 1, MOST_STEPS)
+        return _Collected(j, jnp.where(here, due, state.next), ends, smooth, rows)
+
+    def _interpolate(
+        self, t: Array, past: Array, ends: tuple[End, End]
+    ) -> tuple[State, KeptRow | None]:
+        first, last = ends
+        (a, low), (b, high) = ((x.time.value, x.time.lost) for x in ends)
+        # A step of length one where there is none.
+        known = jnp.where(past, jnp.stack([a, b]), jnp.stack([b - 1, b]))
+        t = jnp.where(past, t, b)
+
+        def weights(times: Array) -> Float[Array, "2 4"]:
+            h = (times[1] - times[0]) + (high - low)
+            return _weights(1 + ((t - times[1]) - high) / h, h)
+
+        found = weights(known)
+
+        def combine(weights: Float[Array, "2 4"]) -> State:
+            return tree.add(*map(_combine, weights, (first.node, last.node)))
+
+        y = combine(found)
+        if not self.keep:
+            return y, None
+        by_time = jnp.moveaxis(jax.jacfwd(weights)(known), -1, 0)
+        return y, KeptRow(found, y, jax.vmap(combine)(by_time))
+
+    def rows(self, state):
+        return state.rows
