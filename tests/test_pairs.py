@@ -96,6 +96,9 @@ def check_order(run: Run, claimed: float, rounding: float):
     numbers = [n for n in NUMBERS if n >= least]
     if run.way.prescribed:
         numbers = [12, 16, 24]
+    if "density" in run.way.name:
+        # The errors of polynomials within steps depend on where the saved times are.
+        numbers = sorted({5, 7, 10, *numbers})
     for n in numbers:
         saved, result = solve(n, run.system, run.y0)
         if not successful(result):

@@ -29,16 +29,20 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     in it: the recommended way to solve, with or without gradients.
 
     Between steps the solution is a Hermite interpolation of degree 11 from four ends of
-    steps, which takes no step of the scheme. Where that cannot follow the motion, it is
-    a shorter step: of schemes up to order two, of `TunedLinear8`, of systems with
-    constraints or on manifolds, in spans of fewer than three steps, where neighbouring
-    steps of `diffrax.StepTo` differ by more than a factor of two, where friction over a
-    step is more than 0.5, or its matrix turns momenta by more than a radian, and with
-    `StepDensityController`. The statistics say which, `sol.stats["interpolated"]`. How
-    strong friction by place or by speed, of a `LagrangianSystem` or in a `force` is, is
+    steps, and within the steps of `StepDensityController` of degree 7 from the two ends
+    of a step. It takes no step of the scheme. Within long steps of schemes with many
+    stages, `TunedRKN6` and compositions of compositions, its error may be larger than
+    that at the ends. Where it cannot follow the motion, it is a shorter step: of
+    schemes up to order two, of `TunedLinear8`, of systems with constraints or on
+    manifolds, in spans of fewer than three steps, where neighbouring steps of
+    `diffrax.StepTo` differ by more than a factor of two, and where friction over a step
+    is more than 0.5, or its matrix turns momenta by more than a radian. The statistics
+    say how many values are interpolated, `sol.stats["interpolated"]`. How strong
+    friction by place or by speed, of a `LagrangianSystem` or in a `force` is, is
     estimated at the start of the solve alone (a relaxation of 1 over a step): if it
-    grows, choose the step by `choose_step` from a solve that saves the same times. The
-    force must have a derivative by `jax.jvp`.
+    grows, choose the step by `choose_step` from a solve that saves the same times. With
+    `StepDensityController` values with such friction are shorter steps. The force must
+    have derivatives by `jax.jvp`, two or, for variable steps, three.
 
     A solve whose final or saved states are not finite fails; of an explicit scheme it
     ends at the next saved time or end of a step that is used for one, as other steps

@@ -185,9 +185,9 @@ class Checkpoints(eqx.Module):
 
 def _track(places: Array, problem: Problem) -> AbstractTrack:
     """What is kept: the steps, and the states at their starts."""
-    last, value = problem.last, lambda j, point: (places[j], point)
+    last, value = problem.last, lambda place, point: (place, point)
     none = jnp.asarray(MOST_STEPS, places.dtype), problem.start
-    return Track(stops_due(places, places <= last, last + 1), value, none)
+    return Track(stops_due(places, places <= last, last + 1), places, value, none)
 
 
 def _until(last: Array, places: Array) -> Array:

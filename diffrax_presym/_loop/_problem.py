@@ -16,7 +16,7 @@ from .._scheme._engine import Result
 from .._system._bound import System
 from ._base import AbstractSteps
 from ._nodes import first_node, Node, node, Stencils
-from ._rows import Rows
+from ._rows import Row, Rows
 from ._steps import Steps
 from ._variable import VariableSteps
 from ._within import End, end_of_step
@@ -172,15 +172,15 @@ class Problem(eqx.Module):
         self,
         i: int,
         functions: Functions,
-        j: Array,
+        row: Row,
         start: Point,
         shorter: bool | None = None,
     ) -> tuple[Array, PyTree, Array]:
-        """The time and the value that output `i` saves in row `j`, from the state at
-        the start of its step, and whether that is finite."""
+        """The time and the value that output `i` saves in a row, from the state at the
+        start of its step, and whether that is finite."""
         rows, y = self.rows[i], start[0]
-        n, inside = rows.stop[j], rows.inside[j]
-        time = rows.time[j] if rows.has_times else self.steps.begin(n, start)
+        time, n, inside = row
+        time = time if rows.has_times else self.steps.begin(n, start)
         if rows.may_be_inside and functions.shorter is not None:
             y = self.between(functions, n, start, time, inside, shorter)
         return time, functions.outputs[i](time, y), tree.all_finite(y)

@@ -13,7 +13,7 @@ from .._scheme._base import Point
 from ._backward import AbstractPull, Backward, BackwardState, zeros
 from ._nodes import NODES, Stencils
 from ._problem import Functions, Problem
-from ._tracks import put, stack
+from ._tracks import apart, put, stack
 from ._within import DERIVATIVES, End
 
 
@@ -62,10 +62,11 @@ def _pull_row(
     """Pull back a value at a step, or by a shorter one from there."""
     problem = backward.problem
     rows, bar = problem.rows[i], backward.row(i, int(problem.subs[i].t0) + j, taken)
+    row = rows.row(j)
 
     def pull(shorter: bool):
         def output(functions: Functions, start: Point):
-            return problem.output(i, functions, j, start, shorter)[:2]
+            return problem.output(i, functions, row, start, shorter)[:2]
 
         return backward.pull(output, bar, at.point)
 
@@ -73,7 +74,7 @@ def _pull_row(
         return at.add(*pull(False))
     # Decided before the derivative is taken: in a batch, JAX would differentiate the
     # branch that is not taken at zeros, where an implicit step is singular.
-    return at.add(*lax.cond(rows.inside[j], lambda: pull(True), lambda: pull(False)))
+    return at.add(*lax.cond(row.inside, lambda: pull(True), lambda: pull(False)))
 
 
 class PullNodes(AbstractPull):
@@ -117,24 +118,32 @@ class PullNodes(AbstractPull):
             last = self.stencils.last(x[2] - 1)
             return (x[2] > self.stencils.earliest) & ((last < 0) | (last >= n))
 
-        def pull(side: Array, at: BackwardState, bars: PyTree):
+        def pull(side: Array, at: BackwardState, bars: PyTree, low: Array):
             node = lambda functions, point: functions.node(n, side, point)
             bar = jtu.tree_map(lambda x: x[n % NODES], bars)
-            at = at.add(*backward.pull(node, bar, at.point))
+            at = at.add(*_apart(low <= n, backward, at, node, bar))
             return at, put(bars, n % NODES, zeros(bar))
 
         _, low, j, bars = state
         kink, kinks = jnp.zeros((), int), problem.steps.kinks
         if kinks is not None:
             kink = jnp.any(kinks == n).astype(int)
-            after = lambda: pull(kink, at, bars)
+            after = lambda: pull(kink, at, bars, low)
             at, bars = lax.cond(kink == 1, after, lambda: (at, bars))
         gradient, low, j, bars = lax.while_loop(
             unspread, spread, (at.gradient, low, j, bars)
         )
         at = eqx.tree_at(lambda at: at.gradient, at, gradient, is_leaf=_is_none)
-        at, bars = pull(-kink, at, bars)
+        at, bars = pull(-kink, at, bars, low)
         return at, (n, low, j, bars)
+
+
+def _apart(here: Array, backward: Backward, at: BackwardState, fn, bar: PyTree):
+    """The cotangents of a node, if it is `here`, apart from all that was saved, as in
+    `_tracks.apart`."""
+    nothing = zeros((at.gradient, at.bar))
+    pull = lambda: backward.pull(fn, bar, at.point)
+    return tree.where(here, apart(here, pull, nothing), nothing)
 
 
 class PullTimed(AbstractPull):
@@ -195,17 +204,13 @@ class PullTimed(AbstractPull):
             stop = self.stops[x[2] - 1]
             return (x[2] > 0) & ((stop < 0) | (stop >= n))
 
-        def pull(at: BackwardState, bars: PyTree):
-            end = lambda functions, point: functions.end(n, point)[0]
-            time, node = jtu.tree_map(lambda x: x[n % 2], bars)
-            bar = End(tree.Sum(time, time), node)
-            at = at.add(*backward.pull(end, bar, at.point))
-            return at, put(bars, n % 2, zeros((time, node)))
-
         _, low, j, bars = state
         at, low, j, bars = lax.while_loop(unspread, spread, (at, low, j, bars))
-        at, bars = lax.cond(low <= n, lambda: pull(at, bars), lambda: (at, bars))
-        return at, (n, low, j, bars)
+        end = lambda functions, point: functions.end(n, point)[0]
+        time, node = jtu.tree_map(lambda x: x[n % 2], bars)
+        bar = End(tree.Sum(time, time), node)
+        at = at.add(*_apart(low <= n, backward, at, end, bar))
+        return at, (n, low, j, put(bars, n % 2, zeros((time, node))))
 
 
 _is_none = lambda x: x is None

@@ -1,5 +1,7 @@
 """What is saved of a solve, and in which of its steps."""
 
+from typing import NamedTuple
+
 import diffrax as dfx
 import equinox as eqx
 import jax.numpy as jnp
@@ -7,6 +9,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._base import AbstractSteps
 from ._steps import Steps
+
+
+class Row(NamedTuple):
+    """One of them."""
+
+    time: Float[Array, ""]
+    stop: Int[Array, ""]
+    inside: Bool[Array, ""]
 
 
 class Rows(eqx.Module):
@@ -64,6 +74,14 @@ class Rows(eqx.Module):
         stop, inside = jnp.where(gap, -1, stop), inside & ~gap
         new = stop, inside, stop + jnp.where(inside, 1, 0)
         return eqx.tree_at(lambda self: (self.stop, self.inside, self.known), self, new)
+
+    @property
+    def each(self) -> Row:
+        """All rows, stacked."""
+        return Row(self.time, self.stop, self.inside)
+
+    def row(self, j: Int[Array, ""]) -> Row:
+        return Row(*(x[j] for x in self.each))
 
     def __len__(self) -> int:
         return len(self.time)

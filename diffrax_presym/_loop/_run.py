@@ -23,7 +23,7 @@ from .._scheme._base import Point
 from .._scheme._engine import cheap_iterations
 from ._base import MOST_STEPS, Stop
 from ._problem import Problem
-from ._rows import Rows
+from ._rows import Row, Rows
 from ._tracks import AbstractTrack, Between, put, stops_due, Track
 from ._variable import VariableSteps
 from ._within import Timed
@@ -110,7 +110,8 @@ def _track(problem: Problem, i: int, keep: bool) -> AbstractTrack | None:
         due &= jnp.arange(len(rows)) < stencils.latest
     stops = stops_due(rows.stop, due, problem.last + 1)
     if not rows.has_times:
-        return Track(stops, saved, (problem.steps.t0, init, jnp.asarray(True)))
+        init = problem.steps.t0, init, jnp.asarray(True)
+        return Track(stops, rows.each, saved, init)
     if isinstance(problem.steps, VariableSteps):
         shorter = None
         if functions.shorter is not None:
@@ -118,18 +119,17 @@ def _track(problem: Problem, i: int, keep: bool) -> AbstractTrack | None:
         how = functions.end, shorter, output, keep
         return Timed(problem.steps, rows.time, *how, y, init)
     if stencils is None:
-        value = lambda j, point: saved(j, point)[1:]
-        return Track(stops, value, (init, jnp.asarray(True)))
+        value = lambda row, point: saved(row, point)[1:]
+        return Track(stops, rows.each, value, (init, jnp.asarray(True)))
     assert functions.node is not None
 
-    def step(j: Array, point: Point) -> State:
-        where = rows.stop[j], point, rows.time[j], rows.inside[j]
-        return problem.between(functions, *where)
+    def step(row: Row, point: Point) -> State:
+        return problem.between(functions, row.stop, point, row.time, row.inside)
 
     kept = lambda y: y if keep else None
-    value = lambda j, y: (output(rows.time[j], y), kept(y))
-    kinks, init = problem.steps.kinks, (init, kept(y))
-    return Between(stencils, stops, kinks, step, functions.node, value, y, init)
+    value = lambda row, y: (output(row.time, y), kept(y))
+    init, about = (init, kept(y)), (problem.steps.kinks, rows.each)
+    return Between(stencils, stops, *about, step, functions.node, value, y, init)
 
 
 def _run_steps(problem: Problem, tracks: PyTree) -> tuple[Progress, Array, PyTree]:

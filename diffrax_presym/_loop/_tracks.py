@@ -10,7 +10,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, Int, PyTree
+from jaxtyping import Array, Bool, Int, PyTree, Shaped
 
 from .. import _tree as tree
 from .._numbers import cast_to, State
@@ -50,7 +50,8 @@ class Track(AbstractTrack):
     """Values at the starts of given steps."""
 
     stops: Int[Array, " rows+1"]  # after those that are due one that is never reached
-    value: Callable[[Array, Point], PyTree]  # of the row and the state there
+    about: PyTree[Shaped[Array, "rows"]]  # what is known of each row
+    value: Callable[[PyTree, Point], PyTree]  # of that and the state there
     init: PyTree
 
     def start(self):
@@ -60,9 +61,12 @@ class Track(AbstractTrack):
         return Stop(self.stops[state[0]])
 
     def visit(self, state, n, point, here):
+        row = row_of(self.about, state[0])
+        value = apart(here, lambda: self.value(row, point), self.init)
+
         def save(state):
             j, rows = state
-            rows = put_here(rows, j, self.value(j, point), here)
+            rows = put_here(rows, j, value, here)
             return j + jnp.asarray(here, j.dtype), rows
 
         return where_any(here, save, state)
@@ -89,9 +93,10 @@ class Between(AbstractTrack):
     stencils: Stencils
     stops: Int[Array, " rows+1"]  # of shorter steps, then one that is never reached
     kinks: Int[Array, " kinks"] | None  # the steps before which derivatives jump
-    step: Callable[[Array, Point], State]  # the state in a row, by a shorter step
+    about: PyTree[Shaped[Array, "rows"]]  # what is known of each row
+    step: Callable[[PyTree, Point], State]  # the state in a row, by a shorter step
     node: Callable[[Array, Array, Point], Node]
-    value: Callable[[Array, State], PyTree]  # of the row and the state in it
+    value: Callable[[PyTree, State], PyTree]  # of the row and the state in it
     y: State  # any
     init: PyTree
 
@@ -109,19 +114,26 @@ class Between(AbstractTrack):
         return Stop(jnp.minimum(*self._due(state)))
 
     def visit(self, state, n, point, here):
-        for due, visit in zip(
-            self._due(state), (self._step, self._visit_node), strict=True
-        ):
-            own = here & (due == n)
-            go = lambda state, own=own, visit=visit: visit(state, n, point, own)
-            state = where_any(own, go, state)
-        return state
+        shorter, own = (here & (due == n) for due in self._due(state))
+        row = row_of(self.about, state.shorter)
+        y = apart(shorter, lambda: self.step(row, point), self.y)
+        state = where_any(
+            shorter, lambda state: self._save_step(state, row, y, shorter), state
+        )
+        kink = jnp.zeros((), int)
+        if self.kinks is not None:
+            kink = jnp.any(self.kinks == n).astype(int)
+        last = jtu.tree_map(lambda x: x[n % NODES], state.ring)
+        node = apart(own, lambda: self.node(n, -kink, point), last)
+        save = lambda state: self._visit_node(state, node, n, kink, point, own)
+        return where_any(own, save, state)
 
-    def _step(self, state: Collected, n: Array, point: Point, here: Array) -> Collected:
+    def _save_step(
+        self, state: Collected, row: PyTree, y: State, here: Array
+    ) -> Collected:
         j = state.shorter
-        y = self.step(j, point)
         # A member of a batch that interpolates it does so later.
-        rows = put_here(state.rows, j, self.value(j, y), here)
+        rows = put_here(state.rows, j, self.value(row, y), here)
         finite = state.finite & (
             ~here | (j >= self.stencils.begin) | tree.all_finite(y)
         )
@@ -129,13 +141,15 @@ class Between(AbstractTrack):
         return eqx.tree_at(lambda x: (x.shorter, x.rows, x.finite), state, new)
 
     def _visit_node(
-        self, state: Collected, n: Array, point: Point, here: Array
+        self,
+        state: Collected,
+        node: Node,
+        n: Array,
+        kink: Array,
+        point: Point,
+        here: Array,
     ) -> Collected:
         ring, finite = state.ring, state.finite
-        kink = jnp.zeros((), int)
-        if self.kinks is not None:
-            kink = jnp.any(self.kinks == n).astype(int)
-        node = self.node(n, -kink, point)
         ring = put_here(ring, n % NODES, node, here)
         complete = lambda j: here & (self.stencils.last(j) <= n)
 
@@ -144,7 +158,8 @@ class Between(AbstractTrack):
             done = complete(j)
             y = self.stencils.combine(j, ring)
             own = done & (j >= self.stencils.begin)
-            return j + done.astype(j.dtype), put_here(rows, j, self.value(j, y), own)
+            value = self.value(row_of(self.about, j), y)
+            return j + done.astype(j.dtype), put_here(rows, j, value, own)
 
         more = lambda x: tree.any_member(complete(x[0]))
         j, rows = lax.while_loop(more, save, (state.interpolated, state.rows))
@@ -161,6 +176,10 @@ class Between(AbstractTrack):
         return state.rows, state.finite
 
 
+def row_of(x: _T, j: Array) -> _T:
+    return jtu.tree_map(lambda x: x[j], x)
+
+
 def stops_due(
     stops: Int[Array, " rows"], due: Bool[Array, " rows"], never: Array
 ) -> Int[Array, " rows+1"]:
@@ -172,6 +191,13 @@ def where_any(here: Bool[Array, ""], visit: Callable[[_T], _T], state: _T) -> _T
     """`visit(state)`, if any member of a batch is `here`: they are asked together, as
     JAX would otherwise copy all that was collected."""
     return lax.cond(tree.any_member(here), visit, lambda state: state, state)
+
+
+def apart(here: Bool[Array, ""], compute: Callable[[], _T], like: _T) -> _T:
+    """What is computed if any member of a batch is `here`, apart from all that was
+    collected: where arrays are small, XLA does one operation after another on a CPU,
+    and otherwise several at once, by threads, which takes longer."""
+    return where_any(here, lambda _: compute(), like)
 
 
 def stack(x: PyTree, number: int) -> PyTree:

@@ -22,7 +22,7 @@ from .._scheme._base import Point, Scheme
 from .._system._bound import System
 from ._base import follows, MOST_STEPS, Stop
 from ._nodes import derivatives, Node
-from ._tracks import AbstractTrack, put_here, stack, where_any
+from ._tracks import AbstractTrack, apart, put_here, stack, where_any
 from ._variable import VariableSteps
 
 
@@ -134,11 +134,8 @@ class Timed(AbstractTrack):
 
     def visit(self, state, n, point, here):
         if (end := self.end) is not None:
-            # Apart from the rows: where all arrays are small, XLA does one operation
-            # after another on a CPU, and otherwise several at once, by threads, which
-            # takes longer.
             last = state.ends[1], state.smooth
-            new, smooth = where_any(here, lambda _: end(n, point), last)
+            new, smooth = apart(here, lambda: end(n, point), last)
             ends = tree.where(here, (state.ends[1], new), state.ends)
             state = state._replace(ends=ends, smooth=smooth)
         go = lambda state: self._visit(state, n, point, here)

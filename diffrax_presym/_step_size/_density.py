@@ -35,9 +35,10 @@ class StepDensityController(dfx.AbstractStepSizeController):
 
     For very uneven motion, such as close encounters; with every symmetric one-step
     scheme of this package and any solver of Diffrax. Not for smooth motion, where
-    constant steps are cheaper. With `FixedStepAdjoint` a saved time takes one step
-    more, of its own length, and gradients are those of the discrete solution, with the
-    dependence of the steps on the states.
+    constant steps are cheaper. With `FixedStepAdjoint` values within steps are
+    interpolated, at the cost of three derivatives of the force along the motion in each
+    such step, and gradients are those of the discrete solution, with the dependence of
+    the steps on the states.
 
     The density may be the system itself. Its time scale is then taken,
 
