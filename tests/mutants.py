@@ -127,7 +127,7 @@ MUTANTS = [
         "& (first < first_node)", "& (first + 2 < first_node)",
         tests="test_shorter_steps.py"),
     Mutant("the derivatives at a kink are those after it", "_loop/_tracks.py",
-        "node = self.node(n, -kink, point)", "node = self.node(n, kink, point)",
+        "lambda: self.node(n, -kink, point)", "lambda: self.node(n, kink, point)",
         tests="test_between_steps.py"),
     Mutant("the cotangent of a node is not cleared", "_loop/_pull.py",
         "return at, put(bars, n % NODES, zeros(bar))", "return at, bars",
