@@ -28,7 +28,7 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     """The loop for steps that are known beforehand or reversible, and exact gradients
     in it: the recommended way to solve, with or without gradients.
 
-    Between steps the solution is a Hermite interpolation of degree 11 from four ends of
+    Between steps the solution is a Hermite interpolation of degree 15 from four ends of
     steps, and within the steps of `StepDensityController` of degree 7 from the two ends
     of a step. It takes no step of the scheme. Within long steps of schemes with many
     stages, `TunedRKN6` and compositions of compositions, its error may be larger than
@@ -42,7 +42,7 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     estimated at the start of the solve alone (a relaxation of 1 over a step): if it
     grows, choose the step by `choose_step` from a solve that saves the same times. With
     `StepDensityController` values with such friction are shorter steps. The force must
-    have derivatives by `jax.jvp`, two or, for variable steps, three.
+    have two derivatives by `jax.jvp`.
 
     A solve whose final or saved states are not finite fails; of an explicit scheme it
     ends at the next saved time or end of a step that is used for one, as other steps

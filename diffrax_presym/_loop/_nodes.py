@@ -1,7 +1,7 @@
 """Values between steps from the ends of several steps, at no stage of the scheme.
 
-Hermite interpolation of degree 11, from the states at the four ends of steps around a
-time, the nodes, and their first two derivatives along the motion.
+Hermite interpolation of degree 15, from the states at the four ends of steps around a
+time, the nodes, and their first three derivatives along the motion.
 """
 
 import math
@@ -25,6 +25,7 @@ from ._steps import Steps
 
 
 NODES = 4  # of a polynomial
+DERIVATIVES = 3  # in each
 # The largest ratio of neighbouring steps.
 _MOST_RATIO = 2.0
 
@@ -41,11 +42,10 @@ def derivatives(
     system: System,
     t: Array,
     point: Point,
-    number: int,
     moment: Array | None = None,
 ) -> Node:
-    """The state at a time of the solve, and so many derivatives in that time, all but
-    the first of a moment later."""
+    """The state at a time of the solve, and its derivatives in that time, all but the
+    first of a moment later."""
     y, force = system.values(point[0]), scheme.end_force(point[1])
 
     def slope(t: Array, y: State, force: PyTree = None) -> State:
@@ -57,7 +57,7 @@ def derivatives(
     if moment is not None:
         t, y = t + cast_to(moment, t), tree.add_scaled(y, moment, first)
     later, rate = [], slope
-    for _ in range(number - 1):
+    for _ in range(DERIVATIVES - 1):
         later.append(jax.jvp(rate, (t, y), along)[1])
         rate = _rate_of(rate, slope)
     return jtu.tree_map(lambda *x: jnp.stack(x), known, first, *later)
@@ -71,13 +71,13 @@ def _rate_of(fn: Callable, slope: Callable) -> Callable:
 def node(
     scheme: Scheme, system: System, steps: Steps, n: Array, side: Array, point: Point
 ) -> Node:
-    """The state at the start of a step, and its first two derivatives: where they jump,
-    those before it (-1) or after it (1)."""
+    """The state at the start of a step, and its derivatives: where they jump, those
+    before it (-1) or after it (1)."""
     t, h, moment = steps.time(n), steps.lengths(n), None
     t = jnp.nextafter(t, t + cast_to(side, t))
     if system.external is not None:
         moment = _moment(jnp.where(side < 0, -h, h))
-    return derivatives(scheme, system, t, point, 2, moment)
+    return derivatives(scheme, system, t, point, moment)
 
 
 def _moment(h: Array) -> Array:
@@ -127,7 +127,7 @@ class Stencils(eqx.Module):
     """The nodes of each row, and their weights."""
 
     first: Int[Array, " rows+1"]  # node; the last is never reached
-    weights: Float[Array, "rows nodes 3"]
+    weights: Float[Array, "rows nodes 4"]
     number: Int[Array, ""]  # of values where a polynomial can follow the solution
     # The first row that is interpolated; the earliest and the latest of these among the
     # members of a batch.
@@ -148,7 +148,7 @@ class Stencils(eqx.Module):
             nodes = [float(i) for i in range(NODES)]
         else:
             nodes = [(steps.time(first + i) - begin) / unit for i in range(NODES)]
-        self.weights = _weights(s, nodes, unit)
+        self.weights = hermite(s, nodes, unit)
         number, due = len(rows), rows.reached(last)
         before = (rows.stop >= 0) & (first < first_node)
         begin = jnp.max(jnp.where(before, jnp.arange(number) + 1, 0), initial=0)
@@ -198,21 +198,23 @@ class Stencils(eqx.Module):
         return jtu.tree_map(leaf, ring, bar)
 
 
-def _weights(s: Array, nodes: list, unit: Array) -> Array:
-    """The weights of value, first and second derivative at each node."""
-    weights = []
+def hermite(s: Array, nodes: list, unit: Array) -> Array:
+    """The weights of the value and each derivative at each node, of lengths in a
+    `unit`."""
+    weights, power = [], DERIVATIVES + 1
     for i, node in enumerate(nodes):
         others = nodes[:i] + nodes[i + 1 :]
-        inverse = [1 / (node - other) for other in others]
-        cube = math.prod((s - x) * c for x, c in zip(others, inverse, strict=True)) ** 3
-        # The Lagrange polynomial is 1 + a d + b d^2 + ..., with d the distance.
-        a, d = sum(inverse), s - node
-        b = (a * a - sum(c * c for c in inverse)) / 2
-        value = 1 + d * (d * (6 * a * a - 3 * b) - 3 * a)
-        each = (
-            value * cube,
-            d * (1 - 3 * a * d) * cube * unit,
-            (d * unit) ** 2 / 2 * cube,
-        )
+        inverse, d = [1 / (node - other) for other in others], s - node
+        lagrange = math.prod((s - x) * c for x, c in zip(others, inverse, strict=True))
+        # The series of its inverse power in d, by that of the logarithm.
+        rates = [power * sum((-c) ** k for c in inverse) for k in range(1, power)]
+        series: list[Any] = [1.0]
+        for k in range(1, power):
+            terms = [rates[m] * series[k - 1 - m] for m in range(k)]
+            series.append(sum(terms) / k)
+        each, scale = [], lagrange**power
+        for k in range(power):
+            rest = sum(c * d**m for m, c in enumerate(series[: power - k]))
+            each.append((d * unit) ** k / math.factorial(k) * rest * scale)
         weights.append(jnp.stack(each, axis=-1))
-    return jnp.stack(weights, axis=1)
+    return jnp.stack(weights, axis=-2)

@@ -32,8 +32,8 @@ class Functions(eqx.Module):
     step: Callable[[Array, Point], tuple[Point, Result]]
     # The state within a step, if any is saved.
     shorter: Callable[[Array, Point, Array], State] | None
-    # The state at the start of a step and its first two derivatives, if used, on a
-    # side of it.
+    # The state at the start of a step and its derivatives, on a side of it, if values
+    # are interpolated.
     node: Callable[[Array, Array, Point], Node] | None
     # The same of a step that varies, with its time, and whether a polynomial can follow
     # the motion within it.

@@ -11,10 +11,10 @@ from .. import _tree as tree
 from .._numbers import cast_to
 from .._scheme._base import Point
 from ._backward import AbstractPull, Backward, BackwardState, zeros
-from ._nodes import NODES, Stencils
+from ._nodes import DERIVATIVES, NODES, Stencils
 from ._problem import Functions, Problem
 from ._tracks import apart, put, stack
-from ._within import DERIVATIVES, End
+from ._within import End
 
 
 def pulls(problem: Problem) -> list[AbstractPull]:
@@ -83,7 +83,7 @@ class PullNodes(AbstractPull):
     stencils: Stencils
 
     def start(self, backward):
-        n, node = backward.trace.n, stack(backward.trace.end[0], 3)
+        n, node = backward.trace.n, stack(backward.trace.end[0], DERIVATIVES + 1)
         # The first that is not known.
         number = jnp.argmax(self.stencils.last(slice(None)) > n)
         return n + 1, n + 1, number, zeros(stack(node, NODES))

@@ -5,7 +5,6 @@ first three derivatives along the motion: unlike that over several steps, as acc
 these where their lengths change fast.
 """
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -21,12 +20,9 @@ from .._numbers import cast_to, State
 from .._scheme._base import Point, Scheme
 from .._system._bound import System
 from ._base import follows, MOST_STEPS, Stop
-from ._nodes import derivatives, Node
+from ._nodes import DERIVATIVES, derivatives, hermite, Node
 from ._tracks import AbstractTrack, apart, put_here, stack, where_any
 from ._variable import VariableSteps
-
-
-DERIVATIVES = 3
 
 
 class End(NamedTuple):
@@ -43,26 +39,10 @@ def end_of_step(
     y, solver_state = point
     carry, _ = steps.split(solver_state)
     begin, h = steps.begin(n, point), steps.end(n, point) - steps.begin(n, point)
-    node = derivatives(scheme, system, begin, (y, carry), DERIVATIVES)
+    node = derivatives(scheme, system, begin, (y, carry))
     h = cast_to(system.direction, h) * h
     smooth = follows(system, system.time(begin), h)
     return End(steps.time(point), node), jnp.asarray(smooth)
-
-
-def _weights(s: Array, h: Array) -> Float[Array, "2 4"]:
-    """Of the value and the derivatives at both ends of a step of length `h`."""
-    unit = jnp.stack([h**k for k in range(DERIVATIVES + 1)])
-    mirrored = jnp.stack([(-h) ** k for k in range(DERIVATIVES + 1)])
-    return jnp.stack([unit * _at_zero(s), mirrored * _at_zero(1 - s)])
-
-
-def _at_zero(s: Array) -> Float[Array, "4"]:
-    """The polynomials of which one derivative at 0 is 1, and the other ones there, and
-    all at 1, are 0."""
-    n = DERIVATIVES
-    series = [math.comb(n + m, n) * s**m for m in range(n + 1)]
-    each = [s**k / math.factorial(k) * sum(series[: n + 1 - k]) for k in range(n + 1)]
-    return (1 - s) ** (n + 1) * jnp.stack(each)
 
 
 def _combine(weights: Float[Array, "4"], node: Node) -> State:
@@ -181,7 +161,7 @@ class Timed(AbstractTrack):
 
         def weights(times: Array) -> Float[Array, "2 4"]:
             h = (times[1] - times[0]) + (high - low)
-            return _weights(1 + ((t - times[1]) - high) / h, h)
+            return hermite(1 + ((t - times[1]) - high) / h, [0.0, 1.0], h)
 
         found = weights(known)
 
