@@ -86,9 +86,8 @@ def test_the_error_between_steps_is_that_at_steps(solver, n, finer):
     sol = solve(solver, n)
     assert sol.stats["interpolated"] and sol.stats["num_steps"] == n
     at = slice(None, None, 160 // n) if 160 % n == 0 else np.arange(0, 161, 8)
-    most = 2 if solver.order(None) < 8 else 8
     for here, all_times in errors(sol.ys, right, at):
-        assert all_times <= most * here < 0.1
+        assert all_times <= 2 * here < 0.1
 
 
 @pytest.mark.parametrize("solver", [RKN4, dps.BlanesMoan6()])
