@@ -5,9 +5,11 @@ import pathlib
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+import pytest
 from jax.flatten_util import ravel_pytree
 
 import diffrax_presym as dps
@@ -116,3 +118,19 @@ def equations(jaxpr):
             part = getattr(part, "jaxpr", part)
             if hasattr(part, "eqns"):
                 yield from equations(part)
+
+
+def check_members(total, members, rtol):
+    """That values and gradients of a batch are those of its members alone, and these
+    central differences. `total(x)` returns a loss, and values and something else, which
+    is returned."""
+    run, value = jax.value_and_grad(total, has_aux=True), jax.jit(total)
+    (_, (ys, other)), gradients = jax.jit(jax.vmap(run))(members)
+    for x, y, gradient in zip(members, ys, gradients, strict=True):
+        (_, (alone, _)), got = jax.jit(run)(x)
+        np.testing.assert_allclose(y, alone, rtol, rtol / 10)
+        np.testing.assert_allclose(gradient, got, 1e3 * rtol, 10 * rtol)
+        for e in 1e-6 * jnp.eye(len(x)):
+            two = (value(x + e)[0] - value(x - e)[0]) / 2e-6
+            assert got @ e / 1e-6 == pytest.approx(float(two), rel=1e-5, abs=1e-7)
+    return other

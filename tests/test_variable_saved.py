@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
+from helpers import check_members
 
 import diffrax_presym as dps
 
@@ -70,7 +71,8 @@ def test_the_error_between_steps_is_that_at_their_ends(name):
     at_ends = error(ends.ts[:n], ends.ys[0][:n])
     inside = np.sum(~np.isin(TS, ends.ts[:n])) - 1  # the first time is the start
     assert sol.stats["interpolated"] == inside
-    assert 1e-11 < error(TS, sol.ys[0]) < 2 * at_ends
+    most = 2 if name == "RKN8" else 1.5
+    assert 1e-11 < error(TS, sol.ys[0]) < most * at_ends
 
 
 def test_saved_values_do_not_depend_on_other_saved_times():
@@ -122,8 +124,8 @@ def test_ends_of_steps_are_those_of_the_other_loop(saved, back):
     assert own.stats["num_steps"] == theirs.stats["num_steps"]
     both = [jax.tree.leaves((sol.ts, sol.ys)) for sol in (own, theirs)]
     for x, y in zip(*both, strict=True):
-        # Within steps these are polynomials and shorter steps.
-        atol = 1e-8 if len(x) == 7 else 1e-10
+        # Within steps the one is a polynomial, the other a shorter step.
+        atol = 1e-8 if x.shape == (7, 2) else 1e-10
         np.testing.assert_allclose(x, y, atol=atol)
 
 
@@ -264,14 +266,6 @@ def test_gradients_where_some_values_are_shorter_steps(way):
         loss = jnp.sum(jnp.where(jnp.isfinite(ys), ys, 0.0) * weights)
         return loss, (ys, sol.stats["interpolated"])
 
-    run, value = jax.value_and_grad(total, has_aux=True), jax.jit(total)
     members = jnp.array([[9.0, 1.0, 1.0], [0.5, 1.0, 0.8], [900.0, 80.0, 1.2]])
-    (_, (ys, number)), gradients = jax.jit(jax.vmap(run))(members)
+    number = check_members(total, members, 1e-11)
     assert number[1] == 45 and 0 < number[0] < 45 and number[2] == 0
-    for x, y, gradient in zip(members, ys, gradients, strict=True):
-        (_, (alone, _)), got = jax.jit(run)(x)
-        np.testing.assert_allclose(y, alone, 1e-11, 1e-12)
-        np.testing.assert_allclose(gradient, got, 1e-8, 1e-10)
-        for e in 1e-6 * jnp.eye(3):
-            two = (value(x + e)[0] - value(x - e)[0]) / 2e-6
-            assert got @ e / 1e-6 == pytest.approx(float(two), rel=1e-5, abs=1e-7)

@@ -190,12 +190,17 @@ class Stencils(eqx.Module):
     def spread(self, j: Array, bar: State, ring: Node) -> Node:
         """The transpose: the cotangents of the nodes, added to a ring of these."""
         place = (jnp.arange(NODES) - self.first[j]) % NODES
+        return spread(self.weights[j, place], bar, ring)
 
-        def leaf(x: Array, bar: Array) -> Array:
-            weights = cast_to(self.weights[j, place], bar)
-            return x + jnp.expand_dims(weights, range(2, x.ndim)) * bar[None, None]
 
-        return jtu.tree_map(leaf, ring, bar)
+def spread(weights: Array, bar: State, nodes: Node) -> Node:
+    """The transpose of the sum of weighted nodes, added to their cotangents."""
+
+    def leaf(x: Array, bar: Array) -> Array:
+        each = jnp.expand_dims(cast_to(weights, bar), range(2, x.ndim))
+        return x + each * bar[None, None]
+
+    return jtu.tree_map(leaf, nodes, bar)
 
 
 def hermite(s: Array, nodes: list, unit: Array) -> Array:

@@ -8,12 +8,12 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Int, PyTree
 
 from .. import _tree as tree
-from .._numbers import cast_to
+from .._numbers import cast_to, State
 from .._scheme._base import Point
 from ._backward import AbstractPull, Backward, BackwardState, zeros
-from ._nodes import DERIVATIVES, NODES, Stencils
+from ._nodes import DERIVATIVES, NODES, spread, Stencils
 from ._problem import Functions, Problem
-from ._tracks import apart, put, stack
+from ._tracks import apart, put, row_of, stack
 from ._within import End
 
 
@@ -62,7 +62,7 @@ def _pull_row(
     """Pull back a value at a step, or by a shorter one from there."""
     problem = backward.problem
     rows, bar = problem.rows[i], backward.row(i, int(problem.subs[i].t0) + j, taken)
-    row = rows.row(j)
+    row = row_of(rows.each, j)
 
     def pull(shorter: bool):
         def output(functions: Functions, start: Point):
@@ -97,24 +97,19 @@ class PullNodes(AbstractPull):
 
     def pull(self, backward, at, state):
         problem, i, n = backward.problem, self.i, at.n
-        rows, start = problem.rows[i], problem.start[0]
+        rows = problem.rows[i]
 
-        def spread(x):
+        def pull_row(x):
             gradient, low, j, bars = x
             j = j - 1
             taken = (rows.stop[j] >= 0) & (j >= self.stencils.begin)
-            _, bar = backward.row(i, int(problem.subs[i].t0) + j, taken)
-            # Of the others nothing may fail of which a gradient takes zero times.
-            time = jnp.where(taken, rows.time[j], problem.steps.t0)
-            y = jtu.tree_map(lambda x: x[j], backward.trace.between[i])
-            y = tree.where(taken, y, start)
-            output = lambda functions, y: functions.outputs[i](time, y)
-            more, bar = backward.pull(output, bar, y)
+            y = row_of(backward.trace.between[i], j)
+            more, bar = _pull_value(backward, i, j, taken, y)
             bars = self.stencils.spread(j, bar, bars)
             low = jnp.where(rows.stop[j] >= 0, self.stencils.first[j], low)
             return tree.add(gradient, more), low, j, bars
 
-        def unspread(x):
+        def more_rows(x):
             last = self.stencils.last(x[2] - 1)
             return (x[2] > self.stencils.earliest) & ((last < 0) | (last >= n))
 
@@ -131,11 +126,22 @@ class PullNodes(AbstractPull):
             after = lambda: pull(kink, at, bars, low)
             at, bars = lax.cond(kink == 1, after, lambda: (at, bars))
         gradient, low, j, bars = lax.while_loop(
-            unspread, spread, (at.gradient, low, j, bars)
+            more_rows, pull_row, (at.gradient, low, j, bars)
         )
         at = eqx.tree_at(lambda at: at.gradient, at, gradient, is_leaf=_is_none)
         at, bars = pull(-kink, at, bars, low)
         return at, (n, low, j, bars)
+
+
+def _pull_value(backward: Backward, i: int, j: Array, taken: Array, y: State):
+    """Pull back what is saved of a state between steps, to the functions and to it."""
+    problem = backward.problem
+    _, bar = backward.row(i, int(problem.subs[i].t0) + j, taken)
+    # Of the others nothing may fail of which a gradient takes zero times.
+    time = jnp.where(taken, problem.rows[i].time[j], problem.steps.t0)
+    y = tree.where(taken, y, problem.start[0])
+    output = lambda functions, y: functions.outputs[i](time, y)
+    return backward.pull(output, bar, y)
 
 
 def _apart(here: Array, backward: Backward, at: BackwardState, fn, bar: PyTree):
@@ -166,31 +172,21 @@ class PullTimed(AbstractPull):
 
     def pull(self, backward, at, state):
         problem, i, n = backward.problem, self.i, at.n
-        rows, start = problem.rows[i], problem.start[0]
+        rows = problem.rows[i]
         interpolated, kept = backward.trace.between[i]
         place = (jnp.arange(2) - (n - 1)) % 2
 
-        def spread(x):
+        def pull_row(x):
             at, low, j, bars = x
             j = j - 1
             own = (rows.stop[j] >= 0) & interpolated[j]
 
             def between():
-                _, bar = backward.row(i, int(problem.subs[i].t0) + j, own)
-                # Of the others nothing may fail of which a gradient takes zero times.
-                time = jnp.where(own, rows.time[j], problem.steps.t0)
-                row = jtu.tree_map(lambda x: x[j], kept)
-                y = tree.where(own, row.y, start)
-                output = lambda functions, y: functions.outputs[i](time, y)
-                more, bar = backward.pull(output, bar, y)
-                times = cast_to(jax.vmap(lambda x: tree.dot(bar, x))(row.by_time), time)
-                weights = row.weights[place]
-
-                def leaf(x: Array, bar: Array) -> Array:
-                    each = jnp.expand_dims(cast_to(weights, bar), range(2, x.ndim))
-                    return x + each * bar[None, None]
-
-                new = bars[0] + times[place], jtu.tree_map(leaf, bars[1], bar)
+                row = row_of(kept, j)
+                more, bar = _pull_value(backward, i, j, own, row.y)
+                by_time = jax.vmap(lambda x: tree.dot(bar, x))(row.by_time)
+                times = bars[0] + cast_to(by_time, bars[0])[place]
+                new = times, spread(row.weights[place], bar, bars[1])
                 return at.add(more, zeros(at.bar)), rows.stop[j] - 1, new
 
             def other():
@@ -200,12 +196,12 @@ class PullTimed(AbstractPull):
             at, low, bars = lax.cond(own, between, other)
             return at, low, j, bars
 
-        def unspread(x):
+        def more_rows(x):
             stop = self.stops[x[2] - 1]
             return (x[2] > 0) & ((stop < 0) | (stop >= n))
 
         _, low, j, bars = state
-        at, low, j, bars = lax.while_loop(unspread, spread, (at, low, j, bars))
+        at, low, j, bars = lax.while_loop(more_rows, pull_row, (at, low, j, bars))
         end = lambda functions, point: functions.end(n, point)[0]
         time, node = jtu.tree_map(lambda x: x[n % 2], bars)
         bar = End(tree.Sum(time, time), node)

@@ -12,11 +12,11 @@ from ._steps import Steps
 
 
 class Row(NamedTuple):
-    """One of them."""
+    """What is known of a row before the solve; or of all rows, stacked."""
 
-    time: Float[Array, ""]
-    stop: Int[Array, ""]
-    inside: Bool[Array, ""]
+    time: Float[Array, "..."]
+    stop: Int[Array, "..."]
+    inside: Bool[Array, "..."]
 
 
 class Rows(eqx.Module):
@@ -77,11 +77,8 @@ class Rows(eqx.Module):
 
     @property
     def each(self) -> Row:
-        """All rows, stacked."""
+        """All rows."""
         return Row(self.time, self.stop, self.inside)
-
-    def row(self, j: Int[Array, ""]) -> Row:
-        return Row(*(x[j] for x in self.each))
 
     def __len__(self) -> int:
         return len(self.time)

@@ -117,9 +117,8 @@ class Between(AbstractTrack):
         shorter, own = (here & (due == n) for due in self._due(state))
         row = row_of(self.about, state.shorter)
         y = apart(shorter, lambda: self.step(row, point), self.y)
-        state = where_any(
-            shorter, lambda state: self._save_step(state, row, y, shorter), state
-        )
+        save_step = lambda state: self._save_step(state, row, y, shorter)
+        state = where_any(shorter, save_step, state)
         kink = jnp.zeros((), int)
         if self.kinks is not None:
             kink = jnp.any(self.kinks == n).astype(int)
