@@ -99,7 +99,8 @@ class Backward(eqx.Module):
 
     def back_to(self, at: BackwardState, first: Array, start: Start) -> BackwardState:
         """All steps back to the start of step `first`, and what was saved there."""
-        tracks = self.tracks
+        # Members of a batch may have ended before.
+        tracks, first = self.tracks, jnp.minimum(first, at.n)
 
         def due(at: BackwardState) -> list[Array]:
             pairs = zip(tracks, at.tracks, strict=True)
@@ -121,14 +122,18 @@ class Backward(eqx.Module):
 
         def stop(at: BackwardState) -> BackwardState:
             wanted = due(at)
-            at = steps(at, reduce(jnp.maximum, wanted, first))
+            # Members of a batch stop together, as on the way there.
+            own = reduce(jnp.maximum, wanted, first)
+            n = -self.problem.steps.common(-own, more(at))
+            at = steps(at, jnp.maximum(n, first))
             for i, (track, wanted_step) in enumerate(zip(tracks, wanted, strict=True)):
 
                 def pull(at: BackwardState, i=i, track=track) -> BackwardState:
-                    at, state = track.pull(self, at, at.tracks[i])
+                    at, state = track.pull(self, n, at, at.tracks[i])
                     return eqx.tree_at(lambda at: at.tracks[i], at, state)
 
-                at = lax.cond(wanted_step == at.n, pull, lambda at: at, at)
+                here = (wanted_step == n) & (at.n == n)
+                at = lax.cond(here, pull, lambda at: at, at)
             return at
 
         return lax.while_loop(more, stop, at)
@@ -177,6 +182,6 @@ class AbstractPull(eqx.Module):
 
     @abc.abstractmethod
     def pull(
-        self, backward: Backward, at: BackwardState, state: PyTree
+        self, backward: Backward, n: Array, at: BackwardState, state: PyTree
     ) -> tuple[BackwardState, PyTree]:
-        """Pull back what is due."""
+        """Pull back what is due at the start of step `n`."""

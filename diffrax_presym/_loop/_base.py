@@ -93,6 +93,11 @@ class AbstractSteps(eqx.Module):
         """The first of some stops, and of the end of the last step."""
 
     @abc.abstractmethod
+    def common(self, n: Int[Array, ""], going: Bool[Array, ""]) -> Int[Array, ""]:
+        """The least number of those members of a batch that are `going` on, if their
+        steps are known."""
+
+    @abc.abstractmethod
     def before(self, stop: Stop, n: Array, point: Point) -> Bool[Array, ""]:
         """Whether a step from here ends at the stop or before."""
 

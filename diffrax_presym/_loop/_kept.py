@@ -12,7 +12,6 @@ from jaxtyping import Array, Bool, PyTree
 from .. import _tree as tree
 from .._scheme._base import Point
 from ._backward import Backward, BackwardState
-from ._base import MOST_STEPS
 from ._problem import Problem
 from ._tracks import AbstractTrack, stops_due, Track
 from ._variable import Kept
@@ -44,17 +43,19 @@ class Reversal(eqx.Module):
 
     def places(self, problem: Problem) -> Array:
         """The steps whose starting states are kept, in order; those that are not are
-        after the last step."""
-        parts, most, last = -(-problem.last // _APART), self.most + 1, problem.last
+        after the last step. All members of a batch keep the same."""
+        most, last = self.most + 1, tree.largest_member(problem.last)
+        parts = -(-last // _APART)
         if problem.growth is not None:
             # Each part may amplify rounding up to the limit.
             allowed, eps = self.limit(problem.start[0])
-            needed = 2 * problem.growth / max(math.log(allowed / eps), 1)
+            growth = tree.largest_member(problem.growth)
+            needed = 2 * growth / max(math.log(allowed / eps), 1)
             # Infinite or undefined growth needs as many as there are.
             needed = jnp.where(needed < most, needed, most)
             parts = jnp.maximum(parts, jnp.ceil(needed).astype(parts.dtype))
         parts = jnp.clip(parts, 1, most)
-        return _until(last, jnp.arange(most) * -(-last // parts))
+        return jnp.arange(most) * jnp.maximum(-(-last // parts), 1)
 
     def track(self, problem: Problem) -> AbstractTrack:
         if problem.steps.are_known:
@@ -63,7 +64,7 @@ class Reversal(eqx.Module):
 
     def pull_back(self, backward: Backward) -> BackwardState:
         problem, trace = backward.problem, backward.trace
-        places, states = trace.kept
+        places, states = _kept(self, backward)
         undo = problem.undo
         assert undo is not None
         at = backward.end()
@@ -101,7 +102,7 @@ class Reversal(eqx.Module):
             miss = miss / jnp.where(largest > 0, largest, 1)  # at rest at the origin
             return at, jnp.maximum(worst, miss), j
 
-        parts = jnp.maximum(jnp.sum(places < trace.n), 1)
+        parts = _parts(backward, places)
         zero = jnp.zeros_like(size(at.point[0]))
         at, miss, _ = lax.while_loop(lambda x: x[2] > 0, part, (at, zero, parts))
         at = backward.start(at)
@@ -149,13 +150,13 @@ class Checkpoints(eqx.Module):
     def places(self, problem: Problem) -> Array:
         length = self.length
         number = max(-(-(self.max_steps or 0) // length), 1)
-        return _until(problem.last, jnp.arange(number) * length)
+        return jnp.arange(number) * length
 
     def track(self, problem: Problem) -> AbstractTrack:
         return _track(self.places(problem), problem)
 
     def pull_back(self, backward: Backward) -> BackwardState:
-        (places, states), length = backward.trace.kept, self.length
+        (places, states), length = _kept(self, backward), self.length
 
         def part(x):
             at, j = x
@@ -178,18 +179,28 @@ class Checkpoints(eqx.Module):
             return backward.back_to(at, first, start), j
 
         at = backward.end()
-        parts = jnp.maximum(jnp.sum(places < backward.trace.n), 1)
+        parts = _parts(backward, places)
         at, _ = lax.while_loop(lambda x: x[1] > 0, part, (at, parts))
         return backward.start(at)
 
 
 def _track(places: Array, problem: Problem) -> AbstractTrack:
-    """What is kept: the steps, and the states at their starts."""
-    last, value = problem.last, lambda place, point: (place, point)
-    none = jnp.asarray(MOST_STEPS, places.dtype), problem.start
-    return Track(stops_due(places, places <= last, last + 1), places, value, none)
+    """The states at the starts of steps, as far as these are taken."""
+    last, value = problem.last, lambda place, point: point
+    return Track(
+        stops_due(places, places <= last, last + 1), places, value, problem.start
+    )
 
 
-def _until(last: Array, places: Array) -> Array:
-    """The places before the last step; the others are after it, but for the first."""
-    return jnp.where((places < last) | (jnp.arange(len(places)) == 0), places, last + 1)
+def _kept(how: Reversal | Checkpoints, backward: Backward) -> tuple[Array, Point]:
+    """The steps whose starting states are kept, and these."""
+    problem, kept = backward.problem, backward.trace.kept
+    return (how.places(problem), kept) if problem.steps.are_known else kept
+
+
+def _parts(backward: Backward, places: Array) -> Array:
+    """The number of parts between kept states on the way back."""
+    number = jnp.maximum(jnp.sum(places < backward.trace.n), 1)
+    # Members of a batch go together. Those that ended before a part have none there.
+    known = backward.problem.steps.are_known
+    return tree.largest_member(number) if known else number

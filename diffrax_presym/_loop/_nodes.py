@@ -124,9 +124,12 @@ def first_node(system: System, steps: Steps, last: Array, y: State) -> Int[Array
 
 
 class Stencils(eqx.Module):
-    """The nodes of each row, and their weights."""
+    """The nodes of each row, and where between them it is."""
 
     first: Int[Array, " rows+1"]  # node; the last is never reached
+    unit: Float[Array, " rows"]  # of time
+    place: Float[Array, " rows"]  # in that unit
+    nodes: Float[Array, "rows nodes"] | None  # if they are not 0, 1, 2, 3
     weights: Float[Array, "rows nodes 4"]
     number: Int[Array, ""]  # of values where a polynomial can follow the solution
     # The first row that is interpolated; the earliest and the latest of these among the
@@ -141,14 +144,14 @@ class Stencils(eqx.Module):
         low, high = steps.smooth_part(stop)
         first = jnp.minimum(stop - NODES // 2, jnp.minimum(high, last) - NODES) + 1
         first = jnp.maximum(first, low)
-        unit = steps.lengths(stop)
-        s = jnp.where(rows.inside, (rows.time - begin) / unit, 0)
+        self.unit, self.nodes = steps.lengths(stop), None
+        self.place = jnp.where(rows.inside, (rows.time - begin) / self.unit, 0)
         if steps.ts is None:
-            s = s + (stop - first).astype(s.dtype)
-            nodes = [float(i) for i in range(NODES)]
+            self.place += (stop - first).astype(begin.dtype)
         else:
-            nodes = [(steps.time(first + i) - begin) / unit for i in range(NODES)]
-        self.weights = hermite(s, nodes, unit)
+            nodes = [steps.time(first + i) - begin for i in range(NODES)]
+            self.nodes = jnp.stack(nodes, axis=-1) / self.unit[:, None]
+        self.weights = _weights(self.place, self.nodes, self.unit)
         number, due = len(rows), rows.reached(last)
         before = (rows.stop >= 0) & (first < first_node)
         begin = jnp.max(jnp.where(before, jnp.arange(number) + 1, 0), initial=0)
@@ -170,27 +173,64 @@ class Stencils(eqx.Module):
         here = (jnp.arange(len(rows)) >= self.begin) & (rows.stop >= 0)
         return jnp.where(here, self.last(slice(-1)), rows.known)
 
-    def combine(self, j: Array, ring: Node) -> State:
-        """The state in row `j`, from a ring of nodes."""
+    def _row(self, j: Array) -> Float[Array, "nodes 4"]:
+        return _row_weights(j, self.weights, self.place, self.nodes, self.unit)
+
+    def combine(self, j: Array, n: Array, ring: Node) -> State:
+        """The state in row `j`, from a ring of nodes of which the last is `n`."""
 
         # Each index once, as many of them take long to trace.
         at = lambda x, i: lax.dynamic_index_in_dim(x, i, keepdims=False)
-        weights, first = at(self.weights, j), self.first[j]
+        weights, first = self._row(j), _first(self.first[j], n)
         nodes = [((first + i) % NODES, weight) for i, weight in enumerate(weights)]
 
         def leaf(ring: Array) -> Array:
             total = jnp.zeros(ring.shape[2:], ring.dtype)
             for place, weight in nodes:
-                for w, x in zip(cast_to(weight, ring), at(ring, place), strict=True):
-                    total = total + w * x
+                for w, x in zip(weight, at(ring, place), strict=True):
+                    total = total + cast_to(w, x) * x
             return total
 
         return jtu.tree_map(leaf, ring)
 
-    def spread(self, j: Array, bar: State, ring: Node) -> Node:
+    def spread(self, j: Array, n: Array, bar: State, ring: Node) -> Node:
         """The transpose: the cotangents of the nodes, added to a ring of these."""
-        place = (jnp.arange(NODES) - self.first[j]) % NODES
-        return spread(self.weights[j, place], bar, ring)
+        place = (jnp.arange(NODES) - _first(self.first[j], n)) % NODES
+        return spread(self._row(j)[place], bar, ring)
+
+
+def _weights(place: Array, nodes: Array | None, unit: Array) -> Array:
+    """Those of the nodes of one row, or of each."""
+    each: Any = range(NODES) if nodes is None else jnp.moveaxis(nodes, -1, 0)
+    return hermite(place, list(each), unit)
+
+
+@jax.custom_batching.custom_vmap
+def _first(first: Array, n: Array) -> Array:
+    """The first node of which `n` is the last: the same for all members of a batch."""
+    return first
+
+
+@_first.def_vmap
+def _(size, in_batched, first, n):
+    return n - (NODES - 1), in_batched[1]
+
+
+@jax.custom_batching.custom_vmap
+def _row_weights(j: Array, weights: Array, *_: Array | None) -> Array:
+    """A row of the weights. If they differ among the members of a batch, they take much
+    memory and are computed for this row alone."""
+    return lax.dynamic_index_in_dim(weights, j, keepdims=False)
+
+
+@_row_weights.def_vmap
+def _(size, in_batched, j, weights, *how):
+    if not in_batched[1]:
+        row = lambda j: lax.dynamic_index_in_dim(weights, j, keepdims=False)
+        return jax.vmap(row)(j), True
+    own = lambda j, *how: _weights(*jtu.tree_map(lambda x: x[j], how))
+    axes = jtu.tree_map(lambda x: 0 if x else None, (in_batched[0], *in_batched[2:]))
+    return jax.vmap(own, axes, axis_size=size)(j, *how), True
 
 
 def spread(weights: Array, bar: State, nodes: Node) -> Node:
@@ -210,16 +250,19 @@ def hermite(s: Array, nodes: list, unit: Array) -> Array:
     for i, node in enumerate(nodes):
         others = nodes[:i] + nodes[i + 1 :]
         inverse, d = [1 / (node - other) for other in others], s - node
-        lagrange = math.prod((s - x) * c for x, c in zip(others, inverse, strict=True))
         # The series of its inverse power in d, by that of the logarithm.
         rates = [power * sum((-c) ** k for c in inverse) for k in range(1, power)]
         series: list[Any] = [1.0]
         for k in range(1, power):
             terms = [rates[m] * series[k - 1 - m] for m in range(k)]
             series.append(sum(terms) / k)
-        each, scale = [], lagrange**power
+        lagrange = math.prod(s - other for other in others) * math.prod(inverse)
+        each, factor = [], lagrange**power
         for k in range(power):
-            rest = sum(c * d**m for m, c in enumerate(series[: power - k]))
-            each.append((d * unit) ** k / math.factorial(k) * rest * scale)
+            rest = series[power - 1 - k]
+            for c in reversed(series[: power - 1 - k]):
+                rest = rest * d + c
+            each.append(rest * factor)
+            factor = factor * (d * unit) * (1 / (k + 1))
         weights.append(jnp.stack(each, axis=-1))
     return jnp.stack(weights, axis=-2)

@@ -48,7 +48,7 @@ class PullRows(AbstractPull):
         stop = self.stops[state - 1]
         return jnp.where(state > 0, jnp.where(stop < 0, n, stop), -1)
 
-    def pull(self, backward, at, state):
+    def pull(self, backward, n, at, state):
         j, problem = state - 1, backward.problem
         taken = problem.rows[self.i].stop[j] >= 0
         if (stencils := problem.stencils[self.i]) is not None:
@@ -95,8 +95,8 @@ class PullNodes(AbstractPull):
         row = jnp.where(j > self.stencils.earliest, row, -1)
         return jnp.where(node > low, node - 1, row)
 
-    def pull(self, backward, at, state):
-        problem, i, n = backward.problem, self.i, at.n
+    def pull(self, backward, n, at, state):
+        problem, i = backward.problem, self.i
         rows = problem.rows[i]
 
         def pull_row(x):
@@ -105,7 +105,7 @@ class PullNodes(AbstractPull):
             taken = (rows.stop[j] >= 0) & (j >= self.stencils.begin)
             y = row_of(backward.trace.between[i], j)
             more, bar = _pull_value(backward, i, j, taken, y)
-            bars = self.stencils.spread(j, bar, bars)
+            bars = self.stencils.spread(j, n, bar, bars)
             low = jnp.where(rows.stop[j] >= 0, self.stencils.first[j], low)
             return tree.add(gradient, more), low, j, bars
 
@@ -170,8 +170,8 @@ class PullTimed(AbstractPull):
         row = jnp.where(j > 0, jnp.where(stop < 0, n, stop), -1)
         return jnp.where(node > low, node - 1, row)
 
-    def pull(self, backward, at, state):
-        problem, i, n = backward.problem, self.i, at.n
+    def pull(self, backward, n, at, state):
+        problem, i = backward.problem, self.i
         rows = problem.rows[i]
         interpolated, kept = backward.trace.between[i]
         place = (jnp.arange(2) - (n - 1)) % 2

@@ -177,11 +177,13 @@ def _run_steps(problem: Problem, tracks: PyTree) -> tuple[Progress, Array, PyTre
         progress, states, reached, going = x
         wanted = due(states)
         first, new = steps.next_stop(wanted, last), []
-        progress = advance_to(first, progress)
-        n, point = steps.number(first, progress.n), progress.point
+        # Members of a batch stop together, at the first step where one of them is to.
+        common = first._replace(n=steps.common(first.n, going))
+        progress = advance_to(steps.next_stop([common], last), progress)
+        n, point = steps.number(common, progress.n), progress.point
         for track, state, next_stop in zip(flat, states, wanted, strict=True):
-            here = steps.at(next_stop, n, point)
-            # Members of a batch that take the same steps are here together.
+            here = steps.at(next_stop, n, point) & (n <= last)
+            # Members that take the same steps are here together.
             alike = here if steps.are_known else here & going
             new.append(track.visit(state, n, point, alike))
         reached = jnp.where(going, progress.n, reached)

@@ -11,6 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
+from .. import _tree as tree
 from .._checks import as_finite
 from .._numbers import cast_to
 from .._scheme._base import advance, Scheme
@@ -251,6 +252,9 @@ class Steps(AbstractSteps):
 
     def next_stop(self, stops, last):
         return Stop(reduce(jnp.minimum, [stop.n for stop in stops], last))
+
+    def common(self, n, going):
+        return tree.first_member(n, going)
 
     def before(self, stop, n, point):
         return n < stop.n

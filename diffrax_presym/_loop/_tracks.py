@@ -155,7 +155,7 @@ class Between(AbstractTrack):
         def save(x):
             j, rows = x
             done = complete(j)
-            y = self.stencils.combine(j, ring)
+            y = self.stencils.combine(j, n, ring)
             own = done & (j >= self.stencils.begin)
             value = self.value(row_of(self.about, j), y)
             return j + done.astype(j.dtype), put_here(rows, j, value, own)
@@ -238,7 +238,12 @@ def _put_here(axis: int) -> Callable[..., Array]:
         if not (batched[2] or batched[3]):
             return _put_here(axis + 1)(xs, x, i, here), True
         i, here = map(each, (i, here), batched[2:])
-        masked = lambda xs, x, i, here: put(xs, i, x, here, axis)
-        return jax.vmap(masked)(xs, x, i, here), True
+
+        def each_at_own(xs, x, i, here):
+            # Out of range where it is not `here`: nothing is read first.
+            i = jnp.where(here, i, xs.shape[axis])
+            return xs.at[(slice(None),) * axis + (i,)].set(x, mode="drop")
+
+        return jax.vmap(each_at_own)(xs, x, i, here), True
 
     return one

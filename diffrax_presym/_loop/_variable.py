@@ -84,6 +84,9 @@ class VariableSteps(AbstractSteps):
         n = reduce(jnp.minimum, [stop.n for stop in stops], last)
         return Stop(n, reduce(jnp.minimum, times) if times else None)
 
+    def common(self, n, going):
+        return n
+
     def before(self, stop, n, point):
         left = (n < stop.n) & ~self.ended(n, point)
         return left if stop.time is None else left & (self.end(n, point) <= stop.time)
