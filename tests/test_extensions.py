@@ -8,7 +8,6 @@ import own
 import pytest
 
 import diffrax_presym as dps
-from diffrax_presym import extend
 
 
 @pytest.mark.parametrize("gradient", [None, "reversal", "checkpoints"])
@@ -39,16 +38,6 @@ def test_arrays_that_a_move_holds_are_differentiated(gradient):
 
     slope = (by_hand(1.3 + 1e-6) - by_hand(1.3 - 1e-6)) / 2e-6
     np.testing.assert_allclose(jax.grad(end)(jnp.asarray(1.3)), slope, rtol=1e-8)
-
-
-def test_a_move_that_prepares_is_prepared_for_each_stage_by_default():
-    system = extend.System(
-        dps.MechanicalSystem(dps.QuadraticKinetic(), lambda t, q, args: jnp.sum(q)),
-        *(None, 1, (jnp.ones(1), jnp.ones(1))),
-    )
-    assert not own.DrivenKick().is_autonomous(system)
-    assert own.SpringKick(1.0).is_autonomous(system)
-    assert extend.Drift("any", 2).is_autonomous(system)
 
 
 def test_fields_of_friction_at_a_place_may_be_numbers():

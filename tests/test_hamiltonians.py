@@ -130,22 +130,6 @@ each = pytest.mark.parametrize(
 )
 
 
-def differences(fn, x, step=1e-5):
-    """The gradient by central differences."""
-    x = np.asarray(x)
-    units = step * np.eye(x.size)
-    return np.array([float(fn(x + e) - fn(x - e)) / (2 * step) for e in units])
-
-
-@each
-def test_velocity_and_force_are_derivatives_of_the_energy(hamiltonian, H):
-    value = jax.jit(lambda q, p: hamiltonian.energy(T, q, p, ARGS))
-    velocity = hamiltonian.velocity(T, Q, P, ARGS)
-    force = hamiltonian.force(T, Q, P, ARGS)
-    np.testing.assert_allclose(velocity, differences(lambda p: value(Q, p), P), 1e-8)
-    np.testing.assert_allclose(force, -differences(lambda q: value(q, P), Q), 1e-8)
-
-
 @each
 def test_canonical_is_the_hamiltonian_of_the_paper(hamiltonian, H):
     canonical = hamiltonian.to_canonical(T, P)

@@ -56,14 +56,6 @@ def test_compositions_agree_with_the_tables_to_the_last_digit(name):
     assert abs(math.fsum(solver.weights) - 1) < 1e-15
 
 
-@pytest.mark.parametrize(
-    "name", [x for x in TABLES if x[:6] in ("Blanes", "Suzuki4", "Sofron")]
-)
-def test_coefficients_are_symmetric(name):
-    table = TABLES[name]["coefficients"]
-    assert table == table[::-1]
-
-
 Y0 = (jnp.array([1.0, 0.5]), jnp.array([0.3, -0.7]))
 
 
