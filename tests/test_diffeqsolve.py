@@ -6,10 +6,9 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-import optimistix as optx
 import pytest
 from catalogue import each, PATHS, pick, Scheme, STATES
-from helpers import assert_close, flat, harmonic, oscillator
+from helpers import assert_close, flat, harmonic
 
 import diffrax_presym as dps
 
@@ -49,66 +48,6 @@ def go(solver, t0, t1, y0, solver_state=None):
         solver_state = start(solver, t0, y0)
     sol = run(solver, t0, t1, dt0, y0, solver_state)
     return jtu.tree_map(lambda y: y[-1], sol.ys), sol.solver_state
-
-
-@eqx.filter_jit
-def march(solver, times, y0):
-    """The same steps in a hand-written loop."""
-
-    def one(carry, span):
-        y, state = carry
-        y, _, _, state, _ = solver.step(TERM, *span, y, ARGS, state, made_jump=False)
-        return (y, state), y
-
-    carry = y0, solver.init(TERM, times[0], times[1], y0, ARGS)
-    _, ys = jax.lax.scan(one, carry, (times[:-1], times[1:]))
-    return jtu.tree_map(lambda y, ys: jnp.concatenate([y[None], ys]), y0, ys)
-
-
-# Saving
-
-TIMES = jnp.array([1.0, 1.0625, 1.125, 1.25, 1.28125, 1.5, 1.625])
-
-
-@each(STATES)
-def test_saving_steps_ends_and_times(scheme: Scheme):
-    position = lambda t, y, args: t + y[0][0]
-    saveat = dfx.SaveAt(
-        subs={
-            "t0": dfx.SubSaveAt(t0=True),
-            "t1": dfx.SubSaveAt(t1=True),
-            "steps": dfx.SubSaveAt(t0=True, steps=True),
-            "every other": dfx.SubSaveAt(steps=2),
-            "function": dfx.SubSaveAt(t0=True, steps=True, fn=position),
-            "ts": dfx.SubSaveAt(ts=jnp.array([1.0, 1.125, 1.3, 1.625])),
-        }
-    )
-
-    @eqx.filter_jit
-    def saved(y0):
-        return dfx.diffeqsolve(
-            *(TERM, scheme.solver, 1.0, 1.625, None, y0, ARGS),
-            saveat=saveat,
-            stepsize_controller=dfx.StepTo(TIMES),
-            max_steps=len(TIMES) - 1,
-        )
-
-    sol = saved(Y0)
-    ts, ys = sol.ts, sol.ys
-    assert ts is not None and ys is not None
-    by_hand = march(scheme.solver, TIMES, Y0)
-    at = lambda *i: jtu.tree_map(lambda y: y[jnp.array(i)], by_hand)
-
-    np.testing.assert_array_equal(ts["steps"], TIMES)
-    assert_close(ys["steps"], by_hand, 1e-14)
-    np.testing.assert_array_equal(ts["every other"], TIMES[2::2])
-    assert_close(ys["every other"], at(2, 4, 6), 1e-14)
-    assert_close(ys["t0"], at(0), 0)
-    assert_close(ys["t1"], at(-1), 1e-14)
-    assert_close(ys["function"], TIMES + by_hand[0][:, 0], 1e-14)
-    # Exact at the steps, and as accurate as the interpolation in between.
-    at_steps = jtu.tree_map(lambda y: y[jnp.array([0, 1, 3])], ys["ts"])
-    assert_close(at_steps, at(0, 2, 6), 1e-14)
 
 
 # Continuing a solve
@@ -159,49 +98,6 @@ def test_a_force_is_not_reused_across_a_jump(scheme: Scheme):
     assert_close(jtu.tree_map(lambda y: y[-1], ys), expected, 1e-12)
 
 
-# States of several structures
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "q0, p0",
-    [(1.0, 0.5), (1, 2), (np.float64(1.0), 2), (jnp.array(1), jnp.array(0.5))],
-    ids=["floats", "integers", "mixed", "arrays"],
-)
-@each(pick("Suzuki-Yoshida 4", "Tao"))
-def test_numbers_are_states_too(scheme: Scheme, q0, p0):
-    solve = lambda y0: dfx.diffeqsolve(oscillator(), scheme.solver, 0, 1, 0.25, y0).ys
-    ys = solve((q0, p0))
-    assert ys is not None
-    assert all(y.shape == (1,) and y.dtype == jnp.float64 for y in ys)
-    as_arrays = jnp.array(q0, float), jnp.array(p0, float)
-    assert_close(ys, solve(as_arrays), 0)
-
-
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-@each(STATES)
-def test_precision_is_that_of_the_input(scheme: Scheme, dtype):
-    saveat = dfx.SaveAt(
-        t0=True, steps=True, ts=jnp.array([1.2], dtype), dense=True, solver_state=True
-    )
-    t0, t1, dt0 = (jnp.array(t, dtype) for t in (1.0, 2.0, 0.25))
-    y0 = jtu.tree_map(lambda y: y.astype(dtype), Y0)
-
-    def everything(y0):
-        sol = dfx.diffeqsolve(
-            *(TERM, scheme.solver, t0, t1, dt0, y0, ARGS.astype(dtype)),
-            saveat=saveat,
-            max_steps=4,
-        )
-        between = sol.evaluate(t0), sol.derivative(t0)
-        return sol.ts, sol.ys, sol.solver_state, sol.interpolation, between
-
-    shapes = eqx.filter_eval_shape(everything, y0)
-    leaves = [x for x in jtu.tree_leaves(shapes) if hasattr(x, "dtype")]
-    floats = [x.dtype for x in leaves if jnp.issubdtype(x.dtype, jnp.floating)]
-    assert len(floats) > 10 and set(floats) == {np.dtype(dtype)}
-
-
 # Termination
 
 
@@ -224,46 +120,6 @@ def test_an_empty_span_is_its_start(scheme: Scheme):
     assert_close(ys, jtu.tree_map(lambda y: jnp.stack([y] * 4), Y0), 0)
     assert_close(state, start(scheme.solver, t0, Y0), 1e-15)
     assert_close(dense, Y0, 0)
-
-
-@pytest.mark.variants(1)
-@each(pick("leapfrog", "Tao 4"))
-def test_too_few_steps(scheme: Scheme):
-    def short(throw):
-        return dfx.diffeqsolve(
-            *(TERM, scheme.solver, 1.0, 2.0, 0.125, Y0, ARGS),
-            max_steps=4,
-            throw=throw,
-            saveat=dfx.SaveAt(steps=True),
-        )
-
-    sol = short(throw=False)
-    assert sol.result == dfx.RESULTS.max_steps_reached
-    by_hand = march(scheme.solver, jnp.array([1.0, 1.125, 1.25, 1.375, 1.5]), Y0)
-    assert_close(sol.ys, jtu.tree_map(lambda y: y[1:], by_hand), 1e-14)
-    with pytest.raises(RuntimeError, match="maximum number of solver steps"):
-        short(throw=True)
-
-
-# The same term in other solvers
-
-OTHERS = {
-    "Tsit5": (dfx.Tsit5(), True, 1e-6),
-    "Kvaerno5": (dfx.Kvaerno5(), True, 1e-6),
-    "ImplicitEuler": (dfx.ImplicitEuler(optx.Newton(1e-8, 1e-8)), False, 5e-3),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("solver, adapts, tolerance", OTHERS.values(), ids=OTHERS)
-def test_the_term_in_other_solvers(solver, adapts, tolerance):
-    controller = dfx.PIDController(rtol=1e-8, atol=1e-8)
-    sol = dfx.diffeqsolve(
-        *(TERM, solver, 1.0, 2.0, 1 / 512, Y0, ARGS),
-        stepsize_controller=controller if adapts else dfx.ConstantStepSize(),
-    )
-    y, _ = go(dps.SofroniouSpaletta(8), 1.0, 2.0, Y0)
-    assert_close(jtu.tree_map(lambda y: y[-1], sol.ys), y, tolerance)
 
 
 # Progress, and compilation
