@@ -83,14 +83,6 @@ HAMILTONIANS = {
         dps.MechanicalSystem(QUADRATIC, potential),
         lambda t, q, P: quadratic(P) + potential(t, q, ARGS),
     ),
-    "separable, relativistic T": (
-        dps.MechanicalSystem(RELATIVISTIC, potential),
-        lambda t, q, P: relativistic(P) + potential(t, q, ARGS),
-    ),
-    "separable, any T": (
-        dps.MechanicalSystem(kinetic, potential),
-        lambda t, q, P: kinetic(t, P, ARGS) + potential(t, q, ARGS),
-    ),
     "nonseparable": (dps.Hamiltonian(energy), lambda t, q, P: energy(t, q, P, ARGS)),
     "conformal, quadratic T": (
         dps.MechanicalSystem(QUADRATIC, potential, LOG),
