@@ -172,22 +172,6 @@ def test_values_at_the_ends_of_steps_cost_no_evaluation():
     assert evaluations(TS[4::3])[0] > at_ends
 
 
-def test_single_precision_at_late_times():
-    ts = jnp.float32(1e5) + jnp.linspace(0.0, 16.0, 65, dtype=jnp.float32)
-    system = dps.MechanicalSystem(dps.QuadraticKinetic(), dps.QuadraticPotential())
-    y0 = jnp.ones(1, jnp.float32), jnp.zeros(1, jnp.float32)
-    sol: Any = dfx.diffeqsolve(
-        *(system, RKN4, ts[0], ts[-1], jnp.float32(0.4), y0),
-        saveat=dfx.SaveAt(ts=ts),
-        adjoint=dps.FixedStepAdjoint(),
-    )
-    assert sol.stats["interpolated"] and sol.ys[0].dtype == jnp.float32
-    assert sol.ts.dtype == jnp.float32
-    # Times are multiples of 2^-7 there.
-    t = np.asarray(ts, float) - 1e5
-    assert np.asarray(sol.ys[0][:, 0]) == pytest.approx(np.cos(t), abs=0.01)
-
-
 GRADIENTS = [
     (RKN4, 40, {}),
     (RKN8, 40, {}),
@@ -227,35 +211,6 @@ def test_gradients_are_central_differences(solver, n, options):
         e = h * jnp.eye(2)[i]
         difference = (loss(x + e) - loss(x - e)) / (2 * h)
         assert got[i] == pytest.approx(float(difference), rel=1e-6)
-
-
-def test_members_of_a_batch_are_those_alone():
-    gammas = jnp.array([0.02, 3.0, 0.3])  # the second takes shorter steps
-
-    def loss(gamma, y0):
-        sol: Any = solve(RKN4, 40, gamma=gamma, y0=y0)
-        return jnp.sum(sol.ys[0] ** 2), (sol.ys, sol.stats["interpolated"])
-
-    run = jax.value_and_grad(loss, has_aux=True)
-    (_, (ys, interpolated)), got = jax.jit(jax.vmap(run, (0, None)))(gammas, Y0)
-    assert (interpolated > 0).tolist() == [True, False, True]
-    for i, gamma in enumerate(gammas):
-        (_, (alone, _)), gradient = jax.jit(run)(gamma, Y0)
-        member = np.stack([y[i] for y in ys])
-        assert member == pytest.approx(np.stack(alone), rel=1e-12, abs=1e-13)
-        assert got[i] == pytest.approx(float(gradient), rel=1e-10)
-
-
-def test_second_derivatives():
-    def loss(x):
-        sol: Any = solve(RKN4, 40, y0=(Y0[0] + x, Y0[1]))
-        return jnp.sum(sol.ys[0][:, 0] ** 2)
-
-    slope, h = jax.jit(jax.grad(loss)), 1e-5
-    _, got = jax.jit(lambda x: jax.jvp(jax.grad(loss), (x,), (jnp.ones(()),)))(0.1)
-    assert got == pytest.approx(
-        float(slope(0.1 + h) - slope(0.1 - h)) / (2 * h), rel=1e-6
-    )
 
 
 def _selected(jaxpr):
@@ -343,3 +298,41 @@ def test_members_of_nested_batches_are_those_alone(solver, kinks, axes):
         got = np.stack([y[i, j] for y in ys])
         np.testing.assert_allclose(got, np.stack(wanted), 1e-11, 1e-12)
         np.testing.assert_allclose(slopes[i, j], slope, 1e-9)
+
+
+@pytest.mark.parametrize("gradient", ["reversal", "checkpoints"])
+def test_a_gradient_of_a_batch_with_a_member_that_fails(gradient):
+    """The rows of a member that failed are not visited on the way back."""
+
+    def loss(stiffness):
+        well = lambda t, q, args: stiffness * jnp.sum(q**2) / 2
+        law = dps.ConstantDamping(0.3)
+        sol: Any = dfx.diffeqsolve(
+            dps.MechanicalSystem(dps.QuadraticKinetic(), well, law),
+            *(GAUSS(4), 0.0, 4.0, 0.2, (jnp.ones(1), jnp.ones(1))),
+            saveat=dfx.SaveAt(ts=jnp.linspace(0.0, 4.0, 9)),
+            adjoint=dps.FixedStepAdjoint(gradient),
+            **{"throw": False, "max_steps": 20},
+        )
+        return jnp.sum(sol.ys[0] ** 2), sol.result == dfx.RESULTS.successful
+
+    slope = jax.jit(jax.vmap(jax.grad(loss, has_aux=True)))
+    got, successful = slope(jnp.array([1.0, 1e4, 1.2]))
+    assert successful.tolist() == [True, False, True]
+    for i, stiffness in ((0, 1.0), (2, 1.2)):
+        alone, _ = jax.jit(jax.grad(loss, has_aux=True))(stiffness)
+        assert got[i] == pytest.approx(float(alone), rel=1e-10)
+
+
+@pytest.mark.parametrize("solver", [RKN4, dps.Strang()])
+def test_hessian(solver):
+    """Of which only derivatives are a batch, not the values."""
+
+    def loss(x):
+        sol: Any = solve(solver, 40, y0=(x, Y0[1]))
+        return jnp.sum(sol.ys[0][:, 0] ** 2)
+
+    slope, h = jax.jit(jax.grad(loss)), 1e-5
+    rows = [(slope(Y0[0] + e) - slope(Y0[0] - e)) / (2 * h) for e in h * jnp.eye(2)]
+    got = jax.jit(jax.hessian(loss))(Y0[0])
+    assert np.asarray(got) == pytest.approx(np.stack(rows), rel=1e-5, abs=1e-6)

@@ -53,6 +53,22 @@ def test_excitation_grows_until_overflow_is_physical():
     assert results[1] == dfx.RESULTS.nonfinite  # pyright: ignore
 
 
+def test_values_between_steps_at_late_times():
+    ts = jnp.float32(1e5) + jnp.linspace(0.0, 16.0, 65, dtype=jnp.float32)
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), dps.QuadraticPotential())
+    y0 = jnp.ones(1, jnp.float32), jnp.zeros(1, jnp.float32)
+    sol: Any = dfx.diffeqsolve(
+        *(system, dps.BlanesMoanRKN4(), ts[0], ts[-1], jnp.float32(0.4), y0),
+        saveat=dfx.SaveAt(ts=ts),
+        adjoint=dps.FixedStepAdjoint(),
+    )
+    assert sol.stats["interpolated"] and sol.ys[0].dtype == jnp.float32
+    assert sol.ts.dtype == jnp.float32
+    # Times are multiples of 2^-7 there.
+    t = np.asarray(ts, float) - 1e5
+    assert np.asarray(sol.ys[0][:, 0]) == pytest.approx(np.cos(t), abs=0.01)
+
+
 # The outputs of a step have the precision of the state. `diffeqsolve` would silently
 # cast `y`, so single steps are tested: parameters are doubles, time and state are not.
 

@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 import pytest
 from helpers import assert_close, henon_heiles, pendulum, solve
 
@@ -201,50 +200,6 @@ def test_a_jump_starts_again():
     exact = last(ends(term, EXACT, 2.0, 4.0, 0.05, half, after))
     assert_close(walk(Y0, True), exact, 1e-8)
     assert largest(walk(Y0, False), exact) > 1e-3
-
-
-@pytest.mark.slow
-def test_events():
-    hamiltonian, solver = system(0.2), dps.SymmetricMultistep(8)
-    cond = lambda t, y, args, **kwargs: y[0][0]
-    event = dfx.Event(cond, optx.Newton(1e-11, 1e-11))
-    sol: Any = solve(hamiltonian, solver, 0.0, 9.0, 0.05, Y0, ONE, event=event)
-    assert sol.result == dfx.RESULTS.event_occurred
-    end = ends(hamiltonian, EXACT, 0.0, sol.ts[-1], 0.05, Y0, ONE)
-    assert abs(float(end[0][-1, 0])) < 1e-9
-    assert_close(sol.ys, end, 1e-8)
-
-
-@pytest.mark.slow
-def test_between_steps_the_error_is_that_at_steps():
-    hamiltonian, solver = system(0.2), dps.SymmetricMultistep(10)
-    saveat = dfx.SaveAt(ts=jnp.linspace(1.0, 6.0, 1 + 160))
-    args = 1.0, 6.0, 0.125, Y0, ONE
-    options = dict(saveat=saveat, adjoint=FIXED)
-    exact = ends(hamiltonian, EXACT, *args, **options)
-    ys = ends(hamiltonian, solver, *args, **options)
-    for y, true in zip(ys, exact, strict=True):
-        errors = np.max(np.abs(y - true), axis=1)
-        assert np.max(errors) < 1.5 * np.max(errors[::4]) < 1e-6
-    # The same from the interpolation of Diffrax, exact at both ends.
-    slow = ends(hamiltonian, solver, *args, saveat=saveat)
-    assert_close(slow, ys, 1e-7)
-    both = dfx.SaveAt(dense=True, steps=True)
-    dense: Any = solve(hamiltonian, solver, *args, saveat=both)
-    at_ends = jax.vmap(dense.evaluate)(dense.ts[:40])
-    assert_close(at_ends, jax.tree.map(lambda x: x[:40], dense.ys), 1e-12)
-
-
-@pytest.mark.slow
-def test_within_several_steps():
-    """Saved times inside of a step that consists of fifty."""
-    base = dps.SymmetricMultistep()
-    saveat = dfx.SaveAt(ts=jnp.array([3.0, 7.5, 14.0, 20.0]))
-    options = dict(saveat=saveat, adjoint=FIXED, max_steps=None)
-    several = dps.Composition(base, (1 / 50,) * 50)
-    args = system(None), several, 0.0, 20.0, 5.0, Y0, ONE
-    exact = ends(args[0], EXACT, 0.0, 20.0, 0.05, Y0, ONE, **options)
-    assert_close(ends(*args, **options), exact, 1e-7)
 
 
 def test_vmap():
