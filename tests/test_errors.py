@@ -196,19 +196,8 @@ SOLVERS = {
     "tableau of another kind": (call(dps.Splitting, (0.5, 1.0, 0.5)),
         "got (0.5, 1.0, 0.5)", "needs a tableau",
         "`Splitting(SplittingTableau(order, kick_first, kind, fractions))`"),
-    **{
-        f"base of a composition {i}": (
-            act,
-            *("`PresymplecticEuler`", SYMMETRIC, OF_LEAPFROG),
-        )
-        for i, act in enumerate(
-            [
-                call(dps.SuzukiYoshida, 4, base=EULER),
-                call(dps.Suzuki4, EULER),
-                call(dps.Composition, EULER, [0.25, 0.5, 0.25]),
-            ]
-        )
-    },
+    "base of a composition": (call(dps.Suzuki4, EULER), "`PresymplecticEuler`",
+        SYMMETRIC, OF_LEAPFROG),
     **{
         f"base of another kind {i}": (
             call(substeps, base, 2),
@@ -216,15 +205,8 @@ SOLVERS = {
         )
         for i, base in enumerate([dfx.Tsit5(), dps.PresymplecticLeapfrog])
     },
-    **{
-        f"Tao in a composition {i}": (
-            on(TERM, solver),
-            *("`PresymplecticTao` needs", FIXED, COUPLING),
-        )
-        for i, solver in enumerate(
-            [dps.SuzukiYoshida(4, base=TAO), dps.Suzuki4(substeps(TAO, 2))]
-        )
-    },
+    "Tao in a composition": (on(TERM, dps.Suzuki4(substeps(TAO, 2))),
+        "`PresymplecticTao` needs", FIXED, COUPLING),
     **{
         f"coupling {x}": (
             call(dps.PresymplecticTao, x),
