@@ -30,7 +30,23 @@ def after_a_jump(a):
     return np.array([1.6 - a**2 / 2 - a * b + b**2 / 2, 0.3 - a + b])
 
 
-def check_jumps(solver, jumps):
+JUMPS = np.random.default_rng(7).uniform(0.05, 1.95, 100)
+OTHERS = dps.Strang(), dps.BlanesMoanRKN4(), dps.BlanesCasasRKN8()
+
+
+@pytest.mark.variants(7)  # marked below
+@pytest.mark.parametrize(
+    "solver, jumps",
+    [
+        (dps.PresymplecticLeapfrog(), [0.9953608518777141, *JUMPS[:8]]),
+        (RKN6, [1.3071239464485345, 0.777, *JUMPS[:8]]),
+        *(
+            pytest.param(solver, JUMPS, marks=pytest.mark.slow)
+            for solver in (*OTHERS, dps.PresymplecticLeapfrog(), RKN6)
+        ),
+    ],
+)
+def test_jumps_inside_of_a_step_have_a_note(solver, jumps):
     system = system_of(lambda t, q, a: jnp.sum(q) * jnp.where(t < a, 1.0, -1.0), 0.0)
 
     @jax.jit
@@ -50,35 +66,6 @@ def check_jumps(solver, jumps):
         error = np.abs(flat(solve(step.dt0, a).ys) - exact)
         if np.max(error / (1 + np.abs(exact))) > 2 * tolerance:
             assert not step.smooth and "StepsBetween" in str(step)
-
-
-JUMPS = np.random.default_rng(7).uniform(0.05, 1.95, 100)
-
-
-@pytest.mark.parametrize(
-    "solver, jumps",
-    [
-        (dps.PresymplecticLeapfrog(), [0.9953608518777141, *JUMPS[:8]]),
-        (RKN6, [1.3071239464485345, 0.777, *JUMPS[:8]]),
-    ],
-)
-def test_jumps_inside_of_a_step_have_a_note(solver, jumps):
-    check_jumps(solver, jumps)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "solver",
-    [
-        dps.Strang(),
-        dps.PresymplecticLeapfrog(),
-        dps.BlanesMoanRKN4(),
-        RKN6,
-        dps.BlanesCasasRKN8(),
-    ],
-)
-def test_many_jumps_have_a_note(solver):
-    check_jumps(solver, JUMPS)
 
 
 # `StepsBetween`, with a force from a table.
