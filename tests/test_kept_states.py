@@ -57,6 +57,47 @@ def test_kept_states_make_up_for_what_damping_forgets(dtype, eta, tolerance):
     assert_close(found, damping_gradient(FIXED_STEP, inputs(jnp.float64)), tolerance)
 
 
+@pytest.mark.parametrize("adjoint", [REVERSIBLE, FIXED_STEP])
+def test_members_of_a_batch_keep_what_each_needs(adjoint):
+    """One of few steps with strong friction, beside one of many."""
+
+    def loss(gamma, t1):
+        saveat = dfx.SaveAt(ts=jnp.linspace(0.0, 1.0, 5) * t1)
+        start = jnp.array([1.0, 0.3]), jnp.zeros(2)
+        sol: Any = dfx.diffeqsolve(
+            *(pendulum(gamma), dps.TunedRKN6(), 0.0, t1, 0.4, start),
+            saveat=saveat,
+            adjoint=adjoint,
+            max_steps=400,
+        )
+        return sum(jnp.sum(y**2) for y in sol.ys)
+
+    gammas, ends = jnp.array([9.0, 0.01, 0.5]), jnp.array([8.0, 150.0, 60.0])
+    slope = jax.grad(loss)
+    alone = jnp.stack(list(map(slope, gammas, ends)))
+    assert_close(jax.vmap(slope)(gammas, ends), alone, 1e-9)
+
+
+@pytest.mark.parametrize("adjoint", [REVERSIBLE, FIXED_STEP])
+@pytest.mark.parametrize("steps, max_steps", [(0, 5), (3, 40)])
+def test_gaps_after_the_end(adjoint, steps, max_steps):
+    """Of measured times: their rows come after those that are not reached."""
+
+    def value(q0, ts):
+        sol: Any = dfx.diffeqsolve(
+            *(pendulum(5.0), dps.TunedRKN6(), 0.0, 5.0, 0.3, (q0, 0 * q0)),
+            saveat=dfx.SaveAt(ts=ts, steps=steps),
+            adjoint=adjoint,
+            max_steps=max_steps,
+            throw=False,
+        )
+        return jnp.sum(jnp.where(jnp.isfinite(sol.ys[0]), sol.ys[0], 0) ** 2)
+
+    slope, q0, ts = jax.grad(value), jnp.ones(1), jnp.array([0.4, 1.0, 3.0])
+    with_gap = slope(q0, jnp.append(ts, jnp.nan))
+    assert_close(with_gap, slope(q0, ts), 1e-12)
+
+
 # States that cannot be recomputed.
 
 # States of the last three rates cannot be recomputed between 8 of 1000 kept ones.

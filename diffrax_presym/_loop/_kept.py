@@ -43,19 +43,21 @@ class Reversal(eqx.Module):
 
     def places(self, problem: Problem) -> Array:
         """The steps whose starting states are kept, in order; those that are not are
-        after the last step. All members of a batch keep the same."""
-        most, last = self.most + 1, tree.largest_member(problem.last)
-        parts = -(-last // _APART)
+        after the last step."""
+        parts, most, last = -(-problem.last // _APART), self.most + 1, problem.last
         if problem.growth is not None:
             # Each part may amplify rounding up to the limit.
             allowed, eps = self.limit(problem.start[0])
-            growth = tree.largest_member(problem.growth)
-            needed = 2 * growth / max(math.log(allowed / eps), 1)
+            needed = 2 * problem.growth / max(math.log(allowed / eps), 1)
             # Infinite or undefined growth needs as many as there are.
             needed = jnp.where(needed < most, needed, most)
             parts = jnp.maximum(parts, jnp.ceil(needed).astype(parts.dtype))
         parts = jnp.clip(parts, 1, most)
-        return jnp.arange(most) * jnp.maximum(-(-last // parts), 1)
+        every = jnp.maximum(-(-last // parts), 1)
+        # All members of a batch keep the same, if there is room for it.
+        least = tree.first_member(every, jnp.asarray(True))
+        room = most * least >= tree.largest_member(last)
+        return jnp.arange(most) * jnp.where(room, least, every)
 
     def track(self, problem: Problem) -> AbstractTrack:
         if problem.steps.are_known:
@@ -64,7 +66,9 @@ class Reversal(eqx.Module):
 
     def pull_back(self, backward: Backward) -> BackwardState:
         problem, trace = backward.problem, backward.trace
-        places, states = _kept(self, backward)
+        places, states = self.places(problem), trace.kept
+        if not problem.steps.are_known:
+            places, states = states
         undo = problem.undo
         assert undo is not None
         at = backward.end()
@@ -156,7 +160,8 @@ class Checkpoints(eqx.Module):
         return _track(self.places(problem), problem)
 
     def pull_back(self, backward: Backward) -> BackwardState:
-        (places, states), length = _kept(self, backward), self.length
+        places, states = self.places(backward.problem), backward.trace.kept
+        length = self.length
 
         def part(x):
             at, j = x
@@ -187,15 +192,8 @@ class Checkpoints(eqx.Module):
 def _track(places: Array, problem: Problem) -> AbstractTrack:
     """The states at the starts of steps, as far as these are taken."""
     last, value = problem.last, lambda place, point: point
-    return Track(
-        stops_due(places, places <= last, last + 1), places, value, problem.start
-    )
-
-
-def _kept(how: Reversal | Checkpoints, backward: Backward) -> tuple[Array, Point]:
-    """The steps whose starting states are kept, and these."""
-    problem, kept = backward.problem, backward.trace.kept
-    return (how.places(problem), kept) if problem.steps.are_known else kept
+    stops = stops_due(places, places < last, last + 1)
+    return Track(stops, places, value, problem.start)
 
 
 def _parts(backward: Backward, places: Array) -> Array:

@@ -40,7 +40,7 @@ class PullRows(AbstractPull):
 
     def start(self, backward):
         problem, i = backward.problem, self.i
-        number = jnp.sum(problem.rows[i].reached(backward.trace.n))
+        number = problem.rows[i].first_left(backward.trace.n)
         stencils = problem.stencils[i]
         return number if stencils is None else jnp.minimum(number, stencils.latest)
 
@@ -159,7 +159,7 @@ class PullTimed(AbstractPull):
 
     def start(self, backward):
         trace, t0 = backward.trace, backward.problem.steps.t0
-        number = jnp.sum(backward.problem.rows[self.i].reached(trace.n))
+        number = backward.problem.rows[self.i].first_left(trace.n)
         node = zeros(stack(stack(trace.end[0], DERIVATIVES + 1), 2))
         bars = stack(jnp.zeros_like(t0), 2), node
         return trace.n + 1, trace.n + 1, number, bars

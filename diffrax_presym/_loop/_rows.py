@@ -87,6 +87,10 @@ class Rows(eqx.Module):
         """Which rows are known after `n` steps."""
         return self.known <= n
 
+    def first_left(self, n: Int[Array, ""]) -> Int[Array, ""]:
+        """The first row that is not known after `n` steps: gaps after it are."""
+        return jnp.argmin(jnp.append(self.reached(n), False)).astype(int)
+
     def taken(self, n: Int[Array, ""]) -> Bool[Array, " rows"]:
         """Which of these have a value."""
         return self.reached(n) & (self.stop >= 0)
