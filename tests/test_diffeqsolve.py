@@ -50,6 +50,30 @@ def go(solver, t0, t1, y0, solver_state=None):
     return jtu.tree_map(lambda y: y[-1], sol.ys), sol.solver_state
 
 
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@each(STATES)
+def test_precision_is_that_of_the_input(scheme: Scheme, dtype):
+    saveat = dfx.SaveAt(
+        t0=True, steps=True, ts=jnp.array([1.2], dtype), dense=True, solver_state=True
+    )
+    t0, t1, dt0 = (jnp.array(t, dtype) for t in (1.0, 2.0, 0.25))
+    y0 = jtu.tree_map(lambda y: y.astype(dtype), Y0)
+
+    def everything(y0):
+        sol = dfx.diffeqsolve(
+            *(TERM, scheme.solver, t0, t1, dt0, y0, ARGS.astype(dtype)),
+            saveat=saveat,
+            max_steps=4,
+        )
+        between = sol.evaluate(t0), sol.derivative(t0)
+        return sol.ts, sol.ys, sol.solver_state, sol.interpolation, between
+
+    shapes = eqx.filter_eval_shape(everything, y0)
+    leaves = [x for x in jtu.tree_leaves(shapes) if hasattr(x, "dtype")]
+    floats = [x.dtype for x in leaves if jnp.issubdtype(x.dtype, jnp.floating)]
+    assert len(floats) > 10 and set(floats) == {np.dtype(dtype)}
+
+
 # Continuing a solve
 
 

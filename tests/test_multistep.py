@@ -202,6 +202,26 @@ def test_a_jump_starts_again():
     assert largest(walk(Y0, False), exact) > 1e-3
 
 
+@pytest.mark.slow
+def test_between_steps_the_error_is_that_at_steps():
+    hamiltonian, solver = system(0.2), dps.SymmetricMultistep(10)
+    saveat = dfx.SaveAt(ts=jnp.linspace(1.0, 6.0, 1 + 160))
+    args = 1.0, 6.0, 0.125, Y0, ONE
+    options = dict(saveat=saveat, adjoint=FIXED)
+    exact = ends(hamiltonian, EXACT, *args, **options)
+    ys = ends(hamiltonian, solver, *args, **options)
+    for y, true in zip(ys, exact, strict=True):
+        errors = np.max(np.abs(y - true), axis=1)
+        assert np.max(errors) < 1.5 * np.max(errors[::4]) < 1e-6
+    # The same from the interpolation of Diffrax, exact at both ends.
+    slow = ends(hamiltonian, solver, *args, saveat=saveat)
+    assert_close(slow, ys, 1e-7)
+    both = dfx.SaveAt(dense=True, steps=True)
+    dense: Any = solve(hamiltonian, solver, *args, saveat=both)
+    at_ends = jax.vmap(dense.evaluate)(dense.ts[:40])
+    assert_close(at_ends, jax.tree.map(lambda x: x[:40], dense.ys), 1e-12)
+
+
 def test_vmap():
     """Some in the batch are at the start while others are not."""
     solver = dps.SymmetricMultistep(8)
