@@ -7,7 +7,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, ArrayLike, Bool, Int, PyTree, Shaped
+from jaxtyping import Array, ArrayLike, Bool, PyTree, Shaped
 
 from ._numbers import cast_to
 
@@ -90,16 +90,9 @@ def _(axis_size, in_batched, x):
     return largest_member(jnp.max(x, axis=0)), False
 
 
-@jax.custom_batching.custom_vmap
-def first_member(x: Int[Array, ""], among: Bool[Array, ""]) -> Int[Array, ""]:
-    """The smallest among some members of a batch, the same for all of them."""
-    return x
-
-
-@first_member.def_vmap
-def _(axis_size, in_batched, x, among):
-    x = jnp.where(among, x, jnp.iinfo(x.dtype).max)
-    return first_member(jnp.min(x, axis=0), jnp.any(among)), False
+def smallest_member(x: Shaped[Array, ""]) -> Shaped[Array, ""]:
+    """The smallest among the members of a batch, the same for all of them."""
+    return -largest_member(-x)
 
 
 def any_member(x: Bool[Array, ""]) -> Bool[Array, ""]:

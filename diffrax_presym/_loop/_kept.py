@@ -55,7 +55,7 @@ class Reversal(eqx.Module):
         parts = jnp.clip(parts, 1, most)
         every = jnp.maximum(-(-last // parts), 1)
         # All members of a batch keep the same, if there is room for it.
-        least = tree.first_member(every, jnp.asarray(True))
+        least = tree.smallest_member(every)
         room = most * least >= tree.largest_member(last)
         return jnp.arange(most) * jnp.where(room, least, every)
 

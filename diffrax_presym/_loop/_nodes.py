@@ -159,7 +159,7 @@ class Stencils(eqx.Module):
         # Values at the ends of steps need no nodes, if they are the only ones.
         self.begin = jnp.where(jnp.any(rows.inside), begin, number)
         self.latest = tree.largest_member(self.begin)
-        self.earliest = number - tree.largest_member(number - self.begin)
+        self.earliest = tree.smallest_member(self.begin)
         # A gap in measured times is saved at once, whatever it is.
         first = jnp.where(rows.stop < 0, -NODES, jnp.where(due, first, last + 1))
         self.first = jnp.append(first, last + 1)

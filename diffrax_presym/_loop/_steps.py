@@ -254,7 +254,7 @@ class Steps(AbstractSteps):
         return Stop(reduce(jnp.minimum, [stop.n for stop in stops], last))
 
     def common(self, n, going):
-        return tree.first_member(n, going)
+        return tree.smallest_member(jnp.where(going, n, MOST_STEPS))
 
     def before(self, stop, n, point):
         return n < stop.n
