@@ -267,6 +267,8 @@ MUTANTS = [
         "number = problem.rows[i].first_left(backward.trace.n)",
         "number = problem.rows[i].first_left(backward.trace.n) - 1",
         ("times", "reversal")),
+    Mutant("members keep the fewest", "_loop/_kept.py", "jnp.where(room, least, every)",
+        "tree.largest_member(every)", tests="test_kept_states.py", only="keep_what"),
     Mutant("outputs of the end are not pulled back", "_loop/_backward.py",
         "at = at.add(*self._pull_point(i, n, point, row))",
         "at = at.add(zeros(at.gradient), zeros(at.bar))",

@@ -315,3 +315,21 @@ def test_relativistic_kinetic_energy_does_not_overflow(p, mass):
         system = dps.MechanicalSystem(kinetic, harmonic, law)
         q, _ = drift(system, t, jnp.float32(1.0), 0 * p, p)
         assert np.all(np.isfinite(q))
+
+
+KINDS = {
+    dps.ConstantDamping: (0.1,),
+    dps.LogDamping: (3.0,),
+    dps.PowerDamping: (0.2, 0.5),
+    dps.ViscousDamping: (np.eye(2),),
+    dps.PositionDamping: (lambda t, q, args: 1.0,),
+    dps.Drag: (0.1,),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda x: x.__name__)
+def test_a_law_is_of_the_class_that_was_written(kind):
+    law = kind(*KINDS[kind])
+    assert isinstance(law, dps.extend.AbstractFriction)
+    assert [other for other in KINDS if isinstance(law, other)] == [kind]
+    assert repr(law).startswith(f"{kind.__name__}(")

@@ -79,13 +79,19 @@ def test_members_of_a_batch_keep_what_each_needs(adjoint):
 
 
 @pytest.mark.parametrize("adjoint", [REVERSIBLE, FIXED_STEP])
-@pytest.mark.parametrize("steps, max_steps", [(0, 5), (3, 40)])
-def test_gaps_after_the_end(adjoint, steps, max_steps):
+@pytest.mark.parametrize(
+    "varies, steps, max_steps", [(False, 0, 5), (False, 3, 40), (True, 0, 5)]
+)
+def test_gaps_after_the_end(adjoint, varies, steps, max_steps):
     """Of measured times: their rows come after those that are not reached."""
+
+    control = dps.StepDensityController(0.2, lambda t, y, args: 1 / (1 + y[0] @ y[0]))
 
     def value(q0, ts):
         sol: Any = dfx.diffeqsolve(
-            *(pendulum(5.0), dps.TunedRKN6(), 0.0, 5.0, 0.3, (q0, 0 * q0)),
+            *(pendulum(5.0), dps.TunedRKN6(), 0.0, 5.0, None if varies else 0.3),
+            (q0, 0 * q0),
+            stepsize_controller=control if varies else dfx.ConstantStepSize(),
             saveat=dfx.SaveAt(ts=ts, steps=steps),
             adjoint=adjoint,
             max_steps=max_steps,
