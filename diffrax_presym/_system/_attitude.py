@@ -3,12 +3,17 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Inexact
 
 from .._checks import as_positive
 from .._numbers import cast_to
 from ._free_rotation import free_rotation, multiply
-from ._manifolds import AbstractManifold, Both, size
+from ._manifolds import AbstractManifold, Both, inner, size
+
+
+# The matrix of the cross product with a vector is linear in that.
+_CROSS = np.cross(np.eye(3)[:, None], np.eye(3)).T
 
 
 class Attitude(AbstractManifold):
@@ -92,10 +97,10 @@ def rotation_matrix(q: Float[Array, "*bodies 4"]) -> Float[Array, "*bodies 3 3"]
 
     - `q`: quaternions of length one, over the last axis, the real part first.
     """
-    w, x, y, z = jnp.moveaxis(q, -1, 0)
-    rows = [
-        [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
-    ]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    w, u = q[..., :1, None], q[..., 1:]
+    # By few operations, as each is compiled anew in every derivative.
+    known = lambda x: jnp.expand_dims(cast_to(x, q), range(q.ndim - 1))
+    cross = jnp.sum(known(_CROSS) * u[..., None, None, :], axis=-1)
+    both = u[..., :, None] * u[..., None, :]
+    square = w**2 - inner(u, u)[..., None]
+    return square * known(np.eye(3)) + 2 * (both + w * cross)

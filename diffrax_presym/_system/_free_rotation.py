@@ -51,7 +51,7 @@ def multiply(x: Quaternions, y: Quaternions) -> Quaternions:
 def _turned_back(q: Quaternions, x: Vectors) -> Vectors:
     """A vector, rotated by the inverse."""
     a, u = q[..., :1], q[..., 1:]
-    moved = jnp.cross(x, u)
+    moved = once(jnp.cross(x, u))
     return x + 2 * (a * moved + jnp.cross(moved, u))
 
 
@@ -106,7 +106,7 @@ def _elliptic(s: Array, alpha: Array, beta: Array, gap: Array) -> Three:
     z = jnp.where(z > _MOST_SQUARE, jnp.nan, z)
     series = 1 + z * (-1 / 6 + z * (1 / 120 + z * (-1 / 5040 + z / 362880)))
     series += square * (1 / 10 + z * (-11 / 420 + z * 17 / 5040) + square / 120)
-    S = s * series
+    S = once(s * series)
 
     def double(_, x: Three) -> Three:
         # Sums of what is not negative: near the middle axis `C` and `D` vanish.
@@ -133,8 +133,8 @@ def _momentum(p: Three, rates: Three, s: Array) -> Three:
     is_second = (v - u) * (v - w) <= 0
     is_first = ~is_second & ((u - v) * (u - w) <= 0)
     is_third = ~(is_second | is_first)
-    u, v, w = _cycled(rates, is_first, is_third)
-    x, y, z = _cycled(p, is_first, is_third)
+    u, v, w = once(_cycled(rates, is_first, is_third))
+    x, y, z = once(_cycled(p, is_first, is_third))
     # Euler's equations: x' = a y z, y' = b z x, z' = c x y, with a c >= 0 >= b a, b c.
     a, b, c = w - v, u - w, v - u
     both, first, third = a * c * y**2, a * b * z**2, b * c * x**2
@@ -153,7 +153,7 @@ def _momentum(p: Three, rates: Three, s: Array) -> Three:
         (z * (D * _one_less(D, beta * square) + third * square) + c * x * y * S * C)
         * scale,
     )
-    return _each(jnp.add, p, _cycled(change, is_third, is_first))
+    return _each(jnp.add, p, _cycled(once(change), is_third, is_first))
 
 
 def _is_small(p: Vectors, rates: Vectors, s: Array) -> Bool[Array, "..."]:
@@ -179,7 +179,7 @@ def _rotation(p: Vectors, rates: Vectors, s: Array) -> tuple[Quaternions, Vector
     # rotation. The angle is an integral. A small rotation is by a series, as these are
     # not defined for a body at rest.
     is_small = _is_small(p, rates, s)
-    start, each = _entries(p), _entries(rates)
+    start, each = once((_entries(p), _entries(rates)))
     momentum = lambda x: _momentum(start, each, x * s)
     later = once(jax.vmap(momentum)(cast_to(_TIMES, p)))
     middle, end = (_each(lambda x, i=i: x[i], later) for i in (len(_NODES) // 2, -1))
@@ -203,14 +203,16 @@ def _rotation(p: Vectors, rates: Vectors, s: Array) -> tuple[Quaternions, Vector
     def about(small: Array, c: Array) -> Array:
         return jnp.where(is_small, small, s * c * mean) / 2
 
-    half = _each(about, _small_angle(start, end, each, s), middle)
-    angle = jnp.sqrt(_dot(half, half))
-    turn = once((jnp.cos(angle), _each(lambda x: x * sinc(angle), half)))
+    half = once(_each(about, _small_angle(start, end, each, s), middle))
+    angle = once(jnp.sqrt(_dot(half, half)))
+    scale = once(sinc(angle))
+    turn = once((jnp.cos(angle), _each(lambda x: x * scale, half)))
 
     def shortest(x: Three, y: Three) -> tuple[Array, Three]:
         real = jnp.where(is_small, 1, _dot(middle, _each(jnp.add, x, y)))
         axis = _each(lambda x: jnp.where(is_small, 0, x), _cross(x, y))
-        scale = 1 / jnp.sqrt(real**2 + _dot(axis, axis))
+        real, axis = once((real, axis))
+        scale = once(1 / jnp.sqrt(real**2 + _dot(axis, axis)))
         return real * scale, _each(lambda x: x * scale, axis)
 
     turn = _product(shortest(middle, start), _product(turn, shortest(end, middle)))
@@ -268,8 +270,8 @@ def _change_along(
         nodes = jax.vmap(lambda x: momentum(p, rates, x * s))(cast_to(_TIMES[:-1], p))
         mean = jnp.tensordot(cast_to(_WEIGHTS, p), nodes**2, 1)
         work += s / 2 * (p**2 + mean) * drates
-    change = _turned_back(turn, dp) - dend
-    along = end * jnp.sum(work, axis=-1, keepdims=True)
+    change = once(_turned_back(turn, dp) - dend)
+    along = once(end * jnp.sum(work, axis=-1, keepdims=True))
     is_small = _is_small(p, rates, s)[..., None]
     square = jnp.where(is_small, 1, inner(p, p))
 
@@ -278,8 +280,8 @@ def _change_along(
         return jnp.stack(_small_angle(start, later, each, s), axis=-1)
 
     at, changes = (p, end, rates, s), (dp, dend, drates, ds)
-    angle, dangle = jax.jvp(small_angle, at, changes)
-    turning = jnp.cross(angle, dangle)
+    angle, dangle = once(jax.jvp(small_angle, at, changes))
+    turning = once(jnp.cross(angle, dangle))
     small = dangle - turning / 2 + jnp.cross(angle, turning) / 6
     theta = (along + jnp.cross(end, change)) / square
     return jnp.where(is_small, small, theta), dend
@@ -292,5 +294,5 @@ def free_rotation(p: Vectors, rates: Vectors, s: Array) -> tuple[Quaternions, Ve
     half of a circle, relative to the body."""
     unit = lax.stop_gradient(jnp.max(jnp.abs(p), axis=-1, keepdims=True))
     unit = jnp.where(unit > 0, unit, 1)
-    turn, end = _rotation(p / unit, rates * unit, s)
+    turn, end = _rotation(*once((p / unit, rates * unit)), s)
     return turn, end * unit
