@@ -15,6 +15,7 @@ from jaxtyping import Array, Int, PyTree
 from .. import _tree as tree
 from .._numbers import State
 from .._scheme._base import Point
+from ._one_function import as_own_function
 from ._problem import Functions, Problem
 from ._run import end_is_separate, Trace
 
@@ -22,6 +23,12 @@ from ._run import end_is_separate, Trace
 def zeros(x: PyTree) -> PyTree:
     """The cotangent zero, for which a `tree.Sum` is two arrays."""
     return jtu.tree_map(jnp.zeros_like, x)
+
+
+def _vjp(n: Array, fn: Callable[..., PyTree], bar: PyTree, *args: PyTree):
+    """The value of `fn(*args)`, and the cotangents of the arguments."""
+    value, pull = as_own_function(lambda: jax.vjp(fn, *args), n)
+    return value, as_own_function(lambda: pull(bar), n)
 
 
 class BackwardState(eqx.Module):
@@ -61,14 +68,14 @@ class Backward(eqx.Module):
         """What is differentiated of the functions, and the rest."""
         return eqx.partition(self.problem.functions, self.wanted)
 
-    def pull(self, fn: Callable[..., PyTree], bar: PyTree, *args: PyTree):
-        """Pull back `fn(functions, *args)`: the cotangents of the functions and of the
-        arguments."""
+    def pull(self, n: Array, fn: Callable[..., PyTree], bar: PyTree, *args: PyTree):
+        """Pull back `fn(functions, *args)`, in iteration `n` of a loop: the cotangents
+        of the functions and of the arguments."""
         moved, fixed = self._functions
         redo = lambda moved, *args: eqx.filter(
             fn(eqx.combine(moved, fixed), *args), eqx.is_inexact_array
         )
-        return jax.vjp(redo, moved, *args)[1](bar)
+        return _vjp(n, redo, bar, moved, *args)[1]
 
     def end(self) -> BackwardState:
         """The end of the solve."""
@@ -141,14 +148,13 @@ class Backward(eqx.Module):
     def step(self, at: BackwardState, start: Start) -> BackwardState:
         """One step back."""
         n = at.n - 1
-        point = start(n, at.point)
+        point = as_own_function(lambda: start(n, at.point), n)
         moved, fixed = self._functions
 
         def redo(moved, point):
             return eqx.combine(moved, fixed).step(n, point)[0]
 
-        end, pull = jax.vjp(redo, moved, point)
-        more, bar = pull(at.bar)
+        end, (more, bar) = _vjp(n, redo, at.bar, moved, point)
         gradient, ends = tree.add(at.gradient, more), (at.point[0], end[0])
         return BackwardState(n, point, bar, gradient, at.tracks, ends)
 
@@ -164,7 +170,7 @@ class Backward(eqx.Module):
             time = self.problem.steps.begin(n, point)
             return time, functions.outputs[i](time, point[0])
 
-        return self.pull(output, bar, point)
+        return self.pull(n, output, bar, point)
 
 
 class AbstractPull(eqx.Module):

@@ -68,7 +68,7 @@ def _pull_row(
         def output(functions: Functions, start: Point):
             return problem.output(i, functions, row, start, shorter)[:2]
 
-        return backward.pull(output, bar, at.point)
+        return backward.pull(at.n, output, bar, at.point)
 
     if not rows.may_be_inside or problem.functions.shorter is None:
         return at.add(*pull(False))
@@ -141,14 +141,14 @@ def _pull_value(backward: Backward, i: int, j: Array, taken: Array, y: State):
     time = jnp.where(taken, problem.rows[i].time[j], problem.steps.t0)
     y = tree.where(taken, y, problem.start[0])
     output = lambda functions, y: functions.outputs[i](time, y)
-    return backward.pull(output, bar, y)
+    return backward.pull(j, output, bar, y)
 
 
 def _apart(here: Array, backward: Backward, at: BackwardState, fn, bar: PyTree):
     """The cotangents of a node, if it is `here`, apart from all that was saved, as in
     `_tracks.apart`."""
     nothing = zeros((at.gradient, at.bar))
-    pull = lambda: backward.pull(fn, bar, at.point)
+    pull = lambda: backward.pull(at.n, fn, bar, at.point)
     return tree.where(here, apart(here, pull, nothing), nothing)
 
 

@@ -17,6 +17,7 @@ from .._numbers import cast_to, State
 from .._scheme._base import Point
 from ._base import Stop
 from ._nodes import DERIVATIVES, Node, NODES, Stencils
+from ._one_function import as_own_function
 
 
 _T = TypeVar("_T")
@@ -62,7 +63,8 @@ class Track(AbstractTrack):
 
     def visit(self, state, n, point, here):
         row = row_of(self.about, state[0])
-        value = apart(here, lambda: self.value(row, point), self.init)
+        value = lambda: as_own_function(lambda: self.value(row, point), n)
+        value = apart(here, value, self.init)
 
         def save(state):
             j, rows = state
@@ -116,7 +118,8 @@ class Between(AbstractTrack):
     def visit(self, state, n, point, here):
         shorter, own = (here & (due == n) for due in self._due(state))
         row = row_of(self.about, state.shorter)
-        y = apart(shorter, lambda: self.step(row, point), self.y)
+        step = lambda: as_own_function(lambda: self.step(row, point), n)
+        y = apart(shorter, step, self.y)
         save_step = lambda state: self._save_step(state, row, y, shorter)
         state = where_any(shorter, save_step, state)
         kink = jnp.zeros((), int)

@@ -21,6 +21,7 @@ from .._scheme._base import Point, Scheme
 from .._system._bound import System
 from ._base import follows, MOST_STEPS, Stop
 from ._nodes import DERIVATIVES, derivatives, hermite, Node
+from ._one_function import as_own_function
 from ._tracks import AbstractTrack, apart, put_here, stack, where_any
 from ._variable import VariableSteps
 
@@ -136,7 +137,8 @@ class Timed(AbstractTrack):
             y = point[0]
             if (shorter := self.shorter) is not None:
                 time = jnp.where(inside, t, now)
-                some = lambda: shorter(n, point, time, inside)
+                step = lambda: shorter(n, point, time, inside)
+                some = lambda: as_own_function(step, n)
                 y = lax.cond(tree.any_member(inside & own), some, lambda: point[0])
             if self.end is not None:
                 between, kept = self._interpolate(t, past, ends)
