@@ -1,7 +1,8 @@
 """How long the first solve takes, most of which is compilation, over that of Tsit5.
 
 Of scalar friction and matrix friction with `TunedRKN6`, and of a mass matrix that
-depends on positions with `PresymplecticGauss(4)`: seconds from the call of `jax.jit` of
+depends on positions with `PresymplecticGauss(4)`, and of two rods with ball joints and
+drag, free bodies with constraints, with `Strang`: seconds from the call of `jax.jit` of
 a solve to its result, that saves the end or at 501 times, and of the gradient of a sum
 of squares at the end. The solvers of Diffrax solve the same system with constant
 steps. Each number is measured in a fresh process, without a cache of compiled programs;
@@ -18,6 +19,7 @@ import sys
 import time
 from typing import Any
 
+import bodies
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
@@ -32,12 +34,15 @@ OURS = {
     "scalar friction": dps.TunedRKN6(),
     "matrix friction": dps.TunedRKN6(),
     "M(q), Gauss": dps.PresymplecticGauss(4),
+    "joined bodies": dps.Strang(),
 }
 SAVED = {"end": None, "501 times": 501, "gradient": None}
 
 
 def system_of(kind):
-    """A chain of pendulums; the last kind are the links of an arm."""
+    """A chain of pendulums, the links of an arm, or rods."""
+    if kind == "joined bodies":
+        return bodies.joined(2)
     if kind == "M(q), Gauss":
         below = N - jnp.maximum(jnp.arange(N)[:, None], jnp.arange(N))
         mass = lambda t, q, args: below * jnp.cos(q[:, None] - q)
@@ -71,6 +76,10 @@ def cold(kind, what, solver):
     if count is not None:
         options["saveat"] = dfx.SaveAt(ts=jnp.linspace(0.0, SPAN, count))
     y0 = jnp.linspace(0.1, 1.0, N), jnp.zeros(N)
+    if kind == "joined bodies":
+        q = jnp.tile(jnp.eye(1, 4), (2, 1))
+        zero = jnp.zeros((2, 3))
+        y0 = (bodies.placed(q)[0], q), (zero, zero)
 
     def run(y0):
         return dfx.diffeqsolve(system, solver, 0.0, SPAN, 0.05, y0, **options).ys
