@@ -15,7 +15,11 @@ import scipy.linalg
 from helpers import assert_close, flat, harmonic, solve, step
 
 import diffrax_presym as dps
-from diffrax_presym._friction._exponential import exponential_products, exponentials
+from diffrax_presym._friction._exponential import (
+    exponential,
+    exponential_products,
+    exponentials,
+)
 from diffrax_presym.diagnostics import energy, energy_error, energy_lost, power_lost
 
 
@@ -176,6 +180,21 @@ def test_exponentials(scale):
         if scale < 1:
             products = exponential_products(matrix, time, Y0[0])
             assert_close(products, (change @ Y0[0], integral @ Y0[0]), 1e-15)
+
+
+@pytest.mark.parametrize("n", [1, 2, 12, 13])
+@pytest.mark.parametrize("scale", [0.0, 1e-9, 2.0, 30.0])
+def test_exponential_of_a_small_or_large_matrix_and_its_derivative(n, scale):
+    # Sizes on both sides of that from which on it is computed by SciPy's algorithm.
+    rng = np.random.default_rng(n)
+    x, dx = rng.standard_normal((2, n, n)) / n
+    x = scale * (x - x.T)
+    found, slope = jax.jvp(exponential, (jnp.asarray(x),), (jnp.asarray(dx),))
+    exact, wanted = scipy.linalg.expm_frechet(x, dx)
+    np.testing.assert_allclose(found, exact, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(slope, wanted, rtol=0, atol=1e-13)
+    if n > 1:
+        np.testing.assert_allclose(found @ found.T, np.eye(n), rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("scale", [0.3, 20.0])

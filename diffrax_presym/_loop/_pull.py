@@ -149,7 +149,7 @@ def _apart(here: Array, backward: Backward, at: BackwardState, fn, bar: PyTree):
     `_tracks.apart`."""
     nothing = zeros((at.gradient, at.bar))
     pull = lambda: backward.pull(at.n, fn, bar, at.point)
-    return tree.where(here, apart(here, pull, nothing), nothing)
+    return tree.where(here, apart(at.n, here, pull, nothing), nothing)
 
 
 class PullTimed(AbstractPull):

@@ -63,8 +63,7 @@ class Track(AbstractTrack):
 
     def visit(self, state, n, point, here):
         row = row_of(self.about, state[0])
-        value = lambda: as_own_function(lambda: self.value(row, point), n)
-        value = apart(here, value, self.init)
+        value = apart(n, here, lambda: self.value(row, point), self.init)
 
         def save(state):
             j, rows = state
@@ -118,15 +117,14 @@ class Between(AbstractTrack):
     def visit(self, state, n, point, here):
         shorter, own = (here & (due == n) for due in self._due(state))
         row = row_of(self.about, state.shorter)
-        step = lambda: as_own_function(lambda: self.step(row, point), n)
-        y = apart(shorter, step, self.y)
+        y = apart(n, shorter, lambda: self.step(row, point), self.y)
         save_step = lambda state: self._save_step(state, row, y, shorter)
         state = where_any(shorter, save_step, state)
         kink = jnp.zeros((), int)
         if self.kinks is not None:
             kink = jnp.any(self.kinks == n).astype(int)
         last = jtu.tree_map(lambda x: x[n % NODES], state.ring)
-        node = apart(own, lambda: self.node(n, -kink, point), last)
+        node = apart(n, own, lambda: self.node(n, -kink, point), last)
         save = lambda state: self._visit_node(state, node, n, kink, point, own)
         return where_any(own, save, state)
 
@@ -195,11 +193,13 @@ def where_any(here: Bool[Array, ""], visit: Callable[[_T], _T], state: _T) -> _T
     return lax.cond(tree.any_member(here), visit, lambda state: state, state)
 
 
-def apart(here: Bool[Array, ""], compute: Callable[[], _T], like: _T) -> _T:
-    """What is computed if any member of a batch is `here`, apart from all that was
-    collected: where arrays are small, XLA does one operation after another on a CPU,
-    and otherwise several at once, by threads, which takes longer."""
-    return where_any(here, lambda _: compute(), like)
+def apart(
+    n: Int[Array, ""], here: Bool[Array, ""], compute: Callable[[], _T], like: _T
+) -> _T:
+    """What is computed at step `n` if any member of a batch is `here`, apart from all
+    that was collected: where arrays are small, XLA does one operation after another on
+    a CPU, and otherwise several at once, by threads, which takes longer."""
+    return where_any(here, lambda _: as_own_function(compute, n), like)
 
 
 def stack(x: PyTree, number: int) -> PyTree:

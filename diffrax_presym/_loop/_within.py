@@ -21,7 +21,6 @@ from .._scheme._base import Point, Scheme
 from .._system._bound import System
 from ._base import follows, MOST_STEPS, Stop
 from ._nodes import DERIVATIVES, derivatives, hermite, Node
-from ._one_function import as_own_function
 from ._tracks import AbstractTrack, apart, put_here, stack, where_any
 from ._variable import VariableSteps
 
@@ -116,7 +115,7 @@ class Timed(AbstractTrack):
     def visit(self, state, n, point, here):
         if (end := self.end) is not None:
             last = state.ends[1], state.smooth
-            new, smooth = apart(here, lambda: end(n, point), last)
+            new, smooth = apart(n, here, lambda: end(n, point), last)
             ends = tree.where(here, (state.ends[1], new), state.ends)
             state = state._replace(ends=ends, smooth=smooth)
         go = lambda state: self._visit(state, n, point, here)
@@ -138,8 +137,7 @@ class Timed(AbstractTrack):
             if (shorter := self.shorter) is not None:
                 time = jnp.where(inside, t, now)
                 step = lambda: shorter(n, point, time, inside)
-                some = lambda: as_own_function(step, n)
-                y = lax.cond(tree.any_member(inside & own), some, lambda: point[0])
+                y = apart(n, inside & own, step, point[0])
             if self.end is not None:
                 between, kept = self._interpolate(t, past, ends)
                 y = tree.where(past, between, y)
