@@ -194,3 +194,23 @@ def test_times_of_steps_between_that_are_not_known_to_be_numbers(sign):
 
     gaps = end(jnp.array([jnp.nan, 0.37, jnp.nan]))
     np.testing.assert_array_equal(gaps, end(jnp.array([-1.0, 0.37, 2.0])))
+
+
+@pytest.mark.parametrize("jit", [False, True])
+def test_gradients_through_prescribed_steps_without_a_limit_of_their_number(jit):
+    ts = jnp.array([0.0, 0.3, 0.5, 1.1, 1.5])
+
+    def end(p, max_steps=None):
+        options: Any = dict(stepsize_controller=dfx.StepTo(ts), max_steps=max_steps)
+        y0, solver = (jnp.ones(1), jnp.full(1, p)), dps.TunedRKN6()
+        sol: Any = dfx.diffeqsolve(
+            *(PENDULUM, solver, 0.0, 1.5, None, y0),
+            adjoint=OWN,
+            **options,
+        )
+        return jnp.sum(sol.ys[0])
+
+    wrap = jax.jit if jit else lambda fn: fn
+    slope, d = wrap(jax.grad(end))(0.3), 1e-5
+    assert slope == jax.grad(end)(0.3, max_steps=9)
+    np.testing.assert_allclose(slope, (end(0.3 + d) - end(0.3 - d)) / (2 * d), 1e-9)

@@ -118,7 +118,7 @@ class Steps(AbstractSteps):
         if isinstance(controller, dfx.StepTo):
             ends = (controller.ts[0] == t0) & (controller.ts[-1] == t1)
             self.ts = eqx.error_if(controller.ts, ~ends, _OTHER_ENDS)
-            self.count = jnp.asarray(len(controller.ts) - 1)
+            self.count = jnp.full((), len(controller.ts) - 1)
             self.starts, self.first = t0[None], jnp.zeros(1, int)
             self.length = jnp.zeros_like(self.starts)
             return
