@@ -246,35 +246,44 @@ def gradients(quick):
         ratio = timed["gradient"].over(timed["solve"])
         table.row(str(int(steps)), memory.temp_size_in_bytes / 1e3, error, ratio)
     number = 16 if quick else 256
-    es = jnp.linspace(0.0, 0.99, number)
+    es, t1 = jnp.linspace(0.0, 0.99, number), jnp.array(200 * np.pi)
 
-    def energy_error(e):
+    def energies(e, saveat):
+        """The sum of errors of what is saved, the last, and the number of steps."""
         start = (
             jnp.stack([1 - e, 0 * e]),
             jnp.stack([0 * e, ((1 + e) / (1 - e)) ** 0.5]),
         )
-        times = 0.0, jnp.array(200 * np.pi)
-        sol = variable(ATTRACTION, dps.TunedRKN6(), times, start, 0.2)
-        q, p = last(sol)
-        return ATTRACTION.energy(0.0, q, p, None) + 0.5, sol.stats["num_steps"]
+        scheme, times = dps.TunedRKN6(), (0.0, t1)
+        sol = variable(ATTRACTION, scheme, times, start, 0.2, saveat=saveat)
+        error = jax.vmap(lambda y: ATTRACTION.energy(0.0, *y, None))(sol.ys) + 0.5
+        return jnp.sum(error), (error[-1], sol.stats["num_steps"])
 
-    alone, batch = jax.jit(energy_error), jax.jit(jax.vmap(energy_error))
-    errors, steps = batch(es)
-    slowest = int(jnp.argmax(steps))
-    calls = {
-        "batch": partial(batch, es),
-        "slowest": partial(alone, es[slowest]),
-        "each": lambda: [alone(e) for e in es],
-    }
-    timed = interleaved(calls, 3)
     table = Table(
         f"A batch of {number} orbits, e from 0 to 0.99, 100 periods",
-        *("fewest steps:>12", "most:>6", "largest energy error:>20.1e"),
+        *("saved:<20", "fewest steps:>12", "most:>6", "largest energy error:>20.1e"),
         *("batch over slowest:>18.1f", "batch over one by one:>21.2f"),
     )
-    extremes = str(int(steps.min())), str(int(steps.max()))
-    ratios = timed["batch"].over(timed["slowest"]), timed["batch"].over(timed["each"])
-    table.row(*extremes, jnp.abs(errors).max(), *ratios)
+    ends, many = dfx.SaveAt(t1=True), dfx.SaveAt(ts=jnp.linspace(0, t1, 201))
+    slopes = jax.grad(energies, has_aux=True)
+    for name, fn, saveat in (
+        ("the end", energies, ends),
+        ("201 times", energies, many),
+        ("201 times, gradient", slopes, many),
+    ):
+        alone = jax.jit(partial(fn, saveat=saveat))
+        batch = jax.jit(jax.vmap(alone))
+        _, (errors, steps) = batch(es)
+        slowest = int(jnp.argmax(steps))
+        calls = {
+            "batch": partial(batch, es),
+            "slowest": partial(alone, es[slowest]),
+            "each": lambda alone=alone: [alone(e) for e in es],
+        }
+        timed = interleaved(calls, 3)
+        extremes = str(int(steps.min())), str(int(steps.max()))
+        ratios = (timed["batch"].over(timed[x]) for x in ("slowest", "each"))
+        table.row(name, *extremes, jnp.abs(errors).max(), *ratios)
 
 
 def picture(energies, ratios):

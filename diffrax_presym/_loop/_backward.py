@@ -113,16 +113,19 @@ class Backward(eqx.Module):
             pairs = zip(tracks, at.tracks, strict=True)
             return [track.due(state, at.n) for track, state in pairs]
 
-        def steps(at: BackwardState, stop: Array) -> BackwardState:
+        def steps(at: BackwardState, stop: Array, going: Array) -> BackwardState:
+            all_steps = self.problem.steps
+            left = lambda at: all_steps.together(at.n > stop, going)
+
             def back(at: BackwardState) -> BackwardState:
                 # Members of a batch that are done repeat a step that may be undone.
                 n = jnp.maximum(at.n, stop + 1)
                 return self.step(eqx.tree_at(lambda at: at.n, at, n), start)
 
-            return lax.while_loop(lambda at: at.n > stop, back, at)
+            return lax.while_loop(left, back, at)
 
         if not tracks:
-            return steps(at, first)
+            return steps(at, first, jnp.asarray(False))
 
         def more(at: BackwardState):
             return (at.n > first) | (reduce(jnp.maximum, due(at)) == at.n)
@@ -131,8 +134,9 @@ class Backward(eqx.Module):
             wanted = due(at)
             # Members of a batch stop together, as on the way there.
             own = reduce(jnp.maximum, wanted, first)
-            n = -self.problem.steps.common(-own, more(at))
-            at = steps(at, jnp.maximum(n, first))
+            going = more(at)
+            n = -self.problem.steps.common(-own, going)
+            at = steps(at, jnp.maximum(n, first), going)
             for i, (track, wanted_step) in enumerate(zip(tracks, wanted, strict=True)):
 
                 def pull(at: BackwardState, i=i, track=track) -> BackwardState:

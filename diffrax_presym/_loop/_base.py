@@ -98,6 +98,11 @@ class AbstractSteps(eqx.Module):
         steps are known."""
 
     @abc.abstractmethod
+    def together(self, left: Bool[Array, ""], going: Bool[Array, ""]) -> Array:
+        """Whether a member of a batch takes another step, of which some are `left` to
+        its stop: if steps are not known, until a member that is `going` on has none."""
+
+    @abc.abstractmethod
     def before(self, stop: Stop, n: Array, point: Point) -> Bool[Array, ""]:
         """Whether a step from here ends at the stop or before."""
 

@@ -13,7 +13,7 @@ from .._scheme._base import Point
 from ._backward import AbstractPull, Backward, BackwardState, zeros
 from ._nodes import DERIVATIVES, NODES, spread, Stencils
 from ._problem import Functions, Problem
-from ._tracks import apart, put, row_of, stack
+from ._tracks import apart, put, row_of, stack, where_any
 from ._within import End
 
 
@@ -179,22 +179,18 @@ class PullTimed(AbstractPull):
         def pull_row(x):
             at, low, j, bars = x
             j = j - 1
-            own = (rows.stop[j] >= 0) & interpolated[j]
-
-            def between():
-                row = row_of(kept, j)
-                more, bar = _pull_value(backward, i, j, own, row.y)
-                by_time = jax.vmap(lambda x: tree.dot(bar, x))(row.by_time)
-                times = bars[0] + cast_to(by_time, bars[0])[place]
-                new = times, spread(row.weights[place], bar, bars[1])
-                return at.add(more, zeros(at.bar)), rows.stop[j] - 1, new
-
-            def other():
-                taken = (rows.stop[j] >= 0) & ~own
-                return _pull_row(backward, at, i, j, taken), low, bars
-
-            at, low, bars = lax.cond(own, between, other)
-            return at, low, j, bars
+            taken, row = rows.stop[j] >= 0, row_of(kept, j)
+            own, other = taken & interpolated[j], taken & ~interpolated[j]
+            # All members of a batch do this, of which others add zero.
+            row = tree.where(own, row, zeros(row))
+            more, bar = _pull_value(backward, i, j, own, row.y)
+            by_time = jax.vmap(lambda x: tree.dot(bar, x))(row.by_time)
+            times = bars[0] + cast_to(by_time, bars[0])[place]
+            bars = times, spread(row.weights[place], bar, bars[1])
+            at = at.add(more, zeros(at.bar))
+            step = lambda at: _pull_row(backward, at, i, j, other)
+            at = where_any(other, step, at)
+            return at, jnp.where(own, rows.stop[j] - 1, low), j, bars
 
         def more_rows(x):
             stop = self.stops[x[2] - 1]

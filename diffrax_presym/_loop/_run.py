@@ -160,12 +160,13 @@ def _run_steps(problem: Problem, tracks: PyTree) -> tuple[Progress, Array, PyTre
     def unfinished(progress: Progress, stop: Stop) -> Bool[Array, ""]:
         return steps.before(stop, progress.n, progress.point) & good(progress)
 
-    def advance_to(stop: Stop, progress: Progress) -> Progress:
+    def advance_to(stop: Stop, progress: Progress, going: Any) -> Progress:
         if not (cheap_iterations() or can_fail):
             block = lambda x: lax.fori_loop(0, _BLOCK, lambda _, x: step(x), x)
             several = lambda progress: progress.n + _BLOCK <= stop.n
             progress = lax.while_loop(several, block, progress)
-        return lax.while_loop(lambda x: unfinished(x, stop), step, progress)
+        more = lambda x: steps.together(unfinished(x, stop), going)
+        return lax.while_loop(more, step, progress)
 
     is_track = lambda x: isinstance(x, AbstractTrack)
     flat, structure = jtu.tree_flatten(tracks, is_leaf=is_track)
@@ -179,7 +180,7 @@ def _run_steps(problem: Problem, tracks: PyTree) -> tuple[Progress, Array, PyTre
         first, new = steps.next_stop(wanted, last), []
         # Members of a batch stop together, at the first step where one of them is to.
         common = first._replace(n=steps.common(first.n, going))
-        progress = advance_to(steps.next_stop([common], last), progress)
+        progress = advance_to(steps.next_stop([common], last), progress, going)
         n, point = steps.number(common, progress.n), progress.point
         for track, state, next_stop in zip(flat, states, wanted, strict=True):
             here = steps.at(next_stop, n, point) & (n <= last)
@@ -199,7 +200,7 @@ def _run_steps(problem: Problem, tracks: PyTree) -> tuple[Progress, Array, PyTre
 
     states = [track.start() for track in flat]
     if not flat:
-        end = advance_to(Stop(last), start)
+        end = advance_to(Stop(last), start, jnp.asarray(False))
         return end, end.n, jtu.tree_unflatten(structure, [])
     # The end is a stop too, so that there is one loop over steps.
     first = start, states, zero, proceeds(start, states)

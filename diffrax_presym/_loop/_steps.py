@@ -9,7 +9,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from .. import _tree as tree
 from .._checks import as_finite
@@ -256,6 +256,9 @@ class Steps(AbstractSteps):
     def common(self, n, going):
         return tree.smallest_member(jnp.where(going, n, MOST_STEPS))
 
+    def together(self, left, going):
+        return left
+
     def before(self, stop, n, point):
         return n < stop.n
 
@@ -314,9 +317,7 @@ class Steps(AbstractSteps):
     def without_gradient(self):
         return self
 
-    def locate(
-        self, ts: Float[Array, " times"]
-    ) -> tuple[Int[Array, " times"], Bool[Array, " times"]]:
+    def locate(self, ts):
         """The step at whose start each time is, or the one that it is inside of; and
         whether it is inside.
 

@@ -87,6 +87,9 @@ class VariableSteps(AbstractSteps):
     def common(self, n, going):
         return n
 
+    def together(self, left, going):
+        return left & ~tree.any_member(going & ~left)
+
     def before(self, stop, n, point):
         left = (n < stop.n) & ~self.ended(n, point)
         return left if stop.time is None else left & (self.end(n, point) <= stop.time)
