@@ -91,9 +91,6 @@ class AbstractMove(eqx.Module):
         return type(self).prepare is AbstractMove.prepare
 
 
-AbstractMove.__init__.__doc__ = "**Arguments:** its fields, if any."
-
-
 class Inverse(AbstractMove):
     """The inverse of a move, as a move."""
 
@@ -105,14 +102,10 @@ class Inverse(AbstractMove):
     def is_autonomous(self, system: System) -> bool:
         return self.move.is_autonomous(system)
 
-    def apply(
-        self, system: System, span: Span, data: PyTree, stage: StepState
-    ) -> Outcome:
+    def apply(self, system, span, data, stage):
         return self.move.undo(system, span, data, stage)
 
-    def undo(
-        self, system: System, span: Span, data: PyTree, stage: StepState
-    ) -> Outcome:
+    def undo(self, system, span, data, stage):
         return self.move.apply(system, span, data, stage)
 
 

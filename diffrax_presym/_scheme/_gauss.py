@@ -18,7 +18,7 @@ from .._numbers import cast_to, State
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, refuse_constrained, Scheme
 from ._collocation import gauss_table, legendre, MAX_STAGES
-from ._engine import AbstractMove, Outcome, Span, StepState
+from ._engine import AbstractMove, Span
 from ._gauss_solve import (
     by_root_finder,
     fixed_point,
@@ -71,9 +71,7 @@ class Collocation(AbstractMove):
     def is_autonomous(self, system: System) -> bool:
         return system.prepares_once
 
-    def apply(
-        self, system: System, span: Span, data: Frames | None, stage: StepState
-    ) -> Outcome:
+    def apply(self, system, span, data, stage):
         y, carry = stage
         sums = tree.to_sums(y, carry.lost)
         values, lost = system.values(sums), tree.rounding_errors(sums)
@@ -87,10 +85,7 @@ class Collocation(AbstractMove):
         carry = lax.stop_gradient(_Carry(tree.rounding_errors(sums), slopes, h))
         return (tree.from_sums(sums, y), carry), result
 
-    def undo(
-        self, system: System, span: Span, data: Frames | None, stage: StepState
-    ) -> Outcome:
-        return self.apply(system, span, data, stage)
+    undo = apply  # of the reversed span
 
     def _guess(
         self, system: System, data: Frames | None, span: Span, carry: _Carry

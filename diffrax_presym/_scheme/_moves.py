@@ -21,9 +21,7 @@ class Enter(AbstractMove):
     kind: str = eqx.field(static=True)
     keeps_manifold: ClassVar[bool] = True
 
-    def apply(
-        self, system: System, span: Span, data: None, stage: StepState
-    ) -> Outcome:
+    def apply(self, system, span, data, stage):
         y, carry = stage
         return (system.split(self.kind).enter(system, span.t0, y), carry), None
 
@@ -46,17 +44,12 @@ class Drift(AbstractMove):
     def is_autonomous(self, system: System) -> bool:
         return system.prepares_once
 
-    def apply(
-        self, system: System, span: Span, data: PyTree, stage: StepState
-    ) -> Outcome:
+    def apply(self, system, span, data, stage):
         (y, carry), split = stage, system.split(self.kind)
         y, result = split.attempt(system, span.t0, span.h, data, y)
         return (y, carry), result
 
-    def undo(
-        self, system: System, span: Span, data: PyTree, stage: StepState
-    ) -> Outcome:
-        return self.apply(system, span, data, stage)
+    undo = apply  # of the reversed span
 
 
 class Kick(AbstractMove):
@@ -71,9 +64,7 @@ class Kick(AbstractMove):
     known: bool = eqx.field(static=True, default=False)
     keeps_manifold: ClassVar[bool] = True
 
-    def apply(
-        self, system: System, span: Span, data: None, stage: StepState
-    ) -> Outcome:
+    def apply(self, system, span, data, stage):
         if not self.known:
             return self.undo(system, span, data, stage)
         (y, force), split = stage, system.split(self.kind)
@@ -111,17 +102,13 @@ class FrozenDrift(AbstractMove):
     def is_autonomous(self, system: System) -> bool:
         return system.prepares_once
 
-    def apply(
-        self, system: System, span: Span, data: PyTree, stage: StepState
-    ) -> Outcome:
+    def apply(self, system, span, data, stage):
         y, carry = stage
         velocity = system.velocity(span.t0, y)
         y = system.add(y, (tree.scale(span.h, velocity), None))
         return (system.decay(data, y), carry), None
 
-    def undo(
-        self, system: System, span: Span, data: PyTree, stage: StepState
-    ) -> Outcome:
+    def undo(self, system, span, data, stage):
         y, carry = stage
         y = system.decay(data, y)
         velocity = system.velocity(span.t1, y)
@@ -136,9 +123,7 @@ class ToSums(AbstractMove):
 
     keeps_manifold: ClassVar[bool] = True
 
-    def apply(
-        self, system: System, span: Span, data: None, stage: StepState
-    ) -> Outcome:
+    def apply(self, system, span, data, stage):
         y, (carry, lost) = stage
         return (tree.to_sums(y, lost), carry), None
 

@@ -29,9 +29,7 @@ class Exchange(AbstractMove):
     second: bool = eqx.field(static=True, default=False)
     known: bool = eqx.field(static=True, default=False)
 
-    def apply(
-        self, system: System, span: Span, data: None, stage: StepState
-    ) -> Outcome:
+    def apply(self, system, span, data, stage):
         if not self.known:
             # The map does not change the arguments of its field: it is its own inverse.
             return self.undo(system, span, data, stage)
@@ -64,16 +62,11 @@ class MoveFrames(AbstractMove):
     def is_autonomous(self, system: System) -> bool:
         return system.prepares_once
 
-    def apply(
-        self, system: System, span: Span, data: PyTree, stage: StepState
-    ) -> Outcome:
+    def apply(self, system, span, data, stage):
         y, (copy, field) = stage
         return (system.decay(data, y), (system.decay(data, copy), field)), None
 
-    def undo(
-        self, system: System, span: Span, data: PyTree, stage: StepState
-    ) -> Outcome:
-        return self.apply(system, span, data, stage)
+    undo = apply  # of the reversed span
 
 
 class Coupling(AbstractMove):
@@ -90,19 +83,14 @@ class Coupling(AbstractMove):
     def is_autonomous(self, system: System) -> bool:
         return True
 
-    def apply(
-        self, system: System, span: Span, data: Array, stage: StepState
-    ) -> Outcome:
+    def apply(self, system, span, data, stage):
         y, (copy, field) = stage
         half = tree.scale(0.5, tree.sub(y, copy))
         change = tree.add_scaled(rotate(data, half), -1, half)
         copy = system.add(copy, tree.scale(-1, change))
         return (system.add(y, change), (copy, field)), None
 
-    def undo(
-        self, system: System, span: Span, data: Array, stage: StepState
-    ) -> Outcome:
-        return self.apply(system, span, data, stage)
+    undo = apply  # of the reversed span
 
 
 def rotate(angle: Array, y: State) -> State:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import PyTree
 
 from .. import _tree as tree
 from .._checks import check_callable, describe, scalar_fn
@@ -123,9 +123,7 @@ class LagrangianSystem(AbstractSystem):
             )
         return cast_to(M, q)
 
-    def from_velocity(
-        self, t: Time, y: tuple[Vector, Vector], args: PyTree = None
-    ) -> tuple[Vector, Vector]:
+    def from_velocity(self, t, y, args=None):
         """The state `(q, p)`, with `p = M(t, q) v`, of positions and velocities.
 
         **Arguments:**
@@ -150,9 +148,7 @@ class LagrangianSystem(AbstractSystem):
     def force(self, t: Time, q: Vector, p: Vector, args: PyTree = None) -> Vector:
         return self.velocity_and_force(t, q, p, args)[1]
 
-    def force_at(
-        self, t: Time, q: Vector, p: Vector, v: Vector, args: PyTree = None
-    ) -> Vector:
+    def force_at(self, t, q, p, v, args=None):
         if len(q) <= WRITTEN_OUT:
             # The compiler shares what this has in common with another velocity here.
             v = self.velocity(t, q, p, args)
@@ -167,9 +163,7 @@ class LagrangianSystem(AbstractSystem):
     def _potential(self, t, q, args):
         return cast_to(scalar_fn(self.potential, "The potential")(t, q, args), q)
 
-    def is_valid(
-        self, t: Time, q: Vector, p: Vector, args: PyTree = None
-    ) -> Bool[Array, ""]:
+    def is_valid(self, t, q, p, args=None):
         M = self.mass_matrix(t, q, args)
         rounding = 1e3 * float(jnp.finfo(M.dtype).eps) * jnp.max(jnp.abs(M), initial=0)
         symmetric = jnp.all(jnp.abs(M - M.T) <= rounding)

@@ -52,9 +52,6 @@ class AbstractManifold(eqx.Module):
         return q
 
 
-AbstractManifold.__init__.__doc__ = "**Arguments:** its fields, if any."
-
-
 class Euclidean(AbstractManifold):
     """Flat space, as a factor of a product."""
 
