@@ -256,7 +256,8 @@ def gradients(quick):
         )
         scheme, times = dps.TunedRKN6(), (0.0, t1)
         sol = variable(ATTRACTION, scheme, times, start, 0.2, saveat=saveat)
-        error = jax.vmap(lambda y: ATTRACTION.energy(0.0, *y, None))(sol.ys) + 0.5
+        energy = lambda q, p: ATTRACTION.energy(0.0, q, p, None)
+        error = jax.vmap(energy)(*sol.ys) + 0.5
         return jnp.sum(error), (error[-1], sol.stats["num_steps"])
 
     table = Table(
