@@ -15,6 +15,8 @@ from typing import Any
 
 import jax
 import numpy as np
+from _report import Table
+from _schemes import DIFFRAX
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,6 +105,31 @@ def error_curves(
     for (key, i), found in errors.items():
         curves[key].append((found, timings[key, i].median, costs[key, i]))
     return {key: curve for key, curve in curves.items() if curve}
+
+
+def diffrax_runs(run, group, counts, tolerances, quick):
+    """Runs of Diffrax's schemes, functions of a solver and whether it is adaptive, and
+    their sweeps."""
+    runs = {}
+    for name in ("Dopri8",) if quick else ("Dopri8", "Tsit5"):
+        solver = DIFFRAX[name].solver
+        runs[group, f"{name}, adaptive"] = run(solver, adaptive=True), tolerances
+        if not quick:
+            runs[group, f"{name}, constant"] = run(solver), counts
+    return runs
+
+
+def print_least(caption, curves, targets, ours):
+    """Tables of the least time to an error, in milliseconds, of each run, and of each
+    group over that of `ours`."""
+    columns = [f"{target:.0e}:>8.2f" for target in targets]
+    both = "kind:<21", "solver:<29"
+    table = Table(f"{caption}: milliseconds to an error", *both, *columns)
+    for (group, name), curve in curves.items():
+        table.row(group, name, *(1e3 * least_to(curve, x) for x in targets))
+    table = Table(f"The least time of each kind over that of {ours}", both[0], *columns)
+    for group in dict.fromkeys(group for group, _ in curves if group != ours):
+        table.row(group, *ratios(curves, targets, group, ours))
 
 
 def least_to(curve, target, by=1):

@@ -28,9 +28,8 @@ import numpy as np
 import scipy.integrate
 import scipy.special
 from _report import command_line, Table
-from _schemes import DIFFRAX
 from _solve import integrated, relative_error, states
-from _timing import error_curves, least_to, ratios
+from _timing import diffrax_runs, error_curves, print_least
 from scipy.spatial.transform import Rotation
 
 import diffrax_presym as dps
@@ -86,27 +85,15 @@ def compare(caption, ours, theirs, simulate, exact, least, quick):
     runs = {}
     for name in list(SCHEMES)[1:2] if quick else SCHEMES:
         runs[OURS, name] = ours(SCHEMES[name]), counts
-    for name in ("Dopri8",) if quick else ("Dopri8", "Tsit5"):
-        solver = DIFFRAX[name].solver
-        runs[THEIRS, f"{name}, adaptive"] = theirs(solver, adaptive=True), tolerances
-        if not quick:
-            runs[THEIRS, f"{name}, constant"] = theirs(solver), counts
+    runs |= diffrax_runs(theirs, THEIRS, counts, tolerances, quick)
     for name in INTEGRATORS if simulate else ():
         runs[MUJOCO, name] = partial(simulate, name), [10 * x for x in counts]
     error = lambda y: relative_error(y, exact)
     enough = (min(TARGETS), 0.1 if quick else 2.0)
     curves = error_curves(runs, error, 2 if quick else 5, enough)
-    columns = [f"{target:.0e}:>8.2f" for target in TARGETS]
-    table = Table(
-        f"{caption}: milliseconds to an error", "program:<15", "scheme:<29", *columns
-    )
-    for (group, name), curve in curves.items():
-        table.row(group, name, *(1e3 * least_to(curve, x) for x in TARGETS))
+    print_least(caption, curves, TARGETS, OURS)
     if not simulate:
-        table.row(MUJOCO, "not installed", *(None for _ in TARGETS))
-    table = Table(f"The least time of each over that of {OURS}", "of:<15", *columns)
-    for group in (THEIRS, MUJOCO):
-        table.row(group, *ratios(curves, TARGETS, group, OURS))
+        print("MuJoCo is not installed.")
 
 
 # A free body.

@@ -25,9 +25,8 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 from _report import command_line, Table
-from _schemes import DIFFRAX
 from _solve import integrated, relative_error, states
-from _timing import error_curves, interleaved, least_to, ratios
+from _timing import diffrax_runs, error_curves, interleaved, print_least
 
 import diffrax_presym as dps
 
@@ -147,30 +146,15 @@ def compare(n, quick, t1=2.0):
         runs[OURS, name] = run(flat, CARTESIAN[name]), counts
     for name in list(GAUSS)[1:2] if quick else GAUSS:
         runs["Gauss, angles", name] = run(turning, GAUSS[name]), counts
-    for name in ("Dopri8",) if quick else ("Dopri8", "Tsit5"):
-        for group, system in ((THEIRS, turning), (OTHERS, flat)):
-            solver = DIFFRAX[name].solver
-            adaptive = run(system, solver, adaptive=True)
-            runs[group, f"{name}, adaptive"] = adaptive, tolerances
-            if not quick:
-                runs[group, f"{name}, constant"] = run(system, solver), counts
+    for group, system in ((THEIRS, turning), (OTHERS, flat)):
+        solves = partial(run, system)
+        runs |= diffrax_runs(solves, group, counts, tolerances, quick)
     exact = cartesian(integrated(turning.vf, start["turning"], t1))
     error = lambda y: relative_error(y, exact)
     enough = (min(TARGETS), 0.1 if quick else 2.0)
     curves = error_curves(runs, error, 2 if quick else 5, enough)
-    titles = [f"{target:.0e}" for target in TARGETS]
-    table = Table(
-        f"A chain of {n} links with friction to t = {t1}: milliseconds to an error",
-        *("kind:<21", "solver:<29", *(f"{title}:>8.2f" for title in titles)),
-    )
-    for (group, name), curve in curves.items():
-        table.row(group, name, *(1e3 * least_to(curve, x) for x in TARGETS))
-    table = Table(
-        "The least time of each kind over that with constraints",
-        *("kind:<21", *(f"{title}:>8.2f" for title in titles)),
-    )
-    for group in dict.fromkeys(group for group, _ in curves if group != OURS):
-        table.row(group, *ratios(curves, TARGETS, group, OURS))
+    caption = f"A chain of {n} links with friction to t = {t1}"
+    print_least(caption, curves, TARGETS, OURS)
 
 
 # Beside mici, whose positions are flat arrays.

@@ -100,12 +100,6 @@ def black_hole():
     return system, (jnp.array([16.0, 0.0]), jnp.array([0.0, 0.27])), 3000.0
 
 
-def mixed(t1):
-    """Tao (2016)."""
-    energy = lambda t, q, p, args: jnp.sum((q**2 + 1) * (p**2 + 1)) / 2
-    return dps.Hamiltonian(energy), (jnp.array([-3.0]), jnp.array([0.0])), t1
-
-
 # The problem, and the longest step to begin with.
 PROBLEMS = {
     "double pendulum": (partial(chain, 2), 0.5),
@@ -115,7 +109,6 @@ PROBLEMS = {
     "geodesic on an ellipsoid": (ellipsoid, 2.0),
     "relativistic charge": (relativistic, 2.0),
     "orbit around a black hole": (black_hole, 200.0),
-    "(q^2 + 1)(p^2 + 1)/2": (partial(mixed, 1e4), 1.0),
 }
 QUICK = ("double pendulum", "charged particle")
 FIXED = {f"Gauss({s})": dps.PresymplecticGauss(s) for s in (3, 4, 6, 8)}

@@ -36,10 +36,7 @@ harmonic = lambda t, q, args: jnp.sum(q**2) / 2
 pendulum = lambda t, q, args: jnp.sum(1 - jnp.cos(q))
 absolute = lambda t, q, args: jnp.sum(jnp.abs(q))
 # Not defined for negative positions.
-root = lambda t, q, args: -jnp.sum(jnp.sqrt(q))
 # Without a lower bound: the motion reaches infinity in finite time.
-quartic = lambda t, q, args: -jnp.sum(q**4)
-mixed = lambda t, q, p, args: (1 + jnp.sum(q**2)) * (1 + jnp.sum(p**2)) / 2
 duffing = lambda t, q, args: jnp.sum(q**4 / 4 - q**2 / 2 - 0.3 * q * jnp.cos(1.2 * t))
 henon_heiles = damped_henon_heiles().system.potential
 height = lambda t, y, args, **kwargs: y[0][0]
@@ -219,30 +216,6 @@ def non_smooth(quick):
         table.row(f"damping jumps {name}", "RKN4", str(count - 1), error)
 
 
-def broken(quick):
-    """What a solve reports whose input breaks at run time."""
-    table = Table(
-        "8. broken input: result, number of steps",
-        *("case:<20", "as it is:>22", "Tsit5:>22"),
-    )
-    implicit = dps.PresymplecticGauss(2, max_iterations=4)
-    y0 = (jnp.array([0.3]), jnp.array([-1.0]))
-    limited = dfx.PIDController(1e-6, 1e-6, dtmin=1e-9, force_dtmin=False)
-    for name, system, base in (
-        ("nan: sqrt of q < 0", mechanics(root), LEAPFROG),
-        ("overflow: -q^4", mechanics(quartic), LEAPFROG),
-        ("4 iterations", dps.Hamiltonian(mixed), implicit),
-    ):
-        cells = []
-        for solver, control in ((base, CONSTANT), (dfx.Tsit5(), limited)):
-            problem = system, solver, 0.0, 20.0, 0.5, y0
-            sol, (q, _) = end(*problem, controller=control)
-            word = "successful" if successful(sol) else "failure"
-            finite = "" if np.isfinite(q).all() else ", nan"
-            cells.append(f"{word} at {int(sol.stats['num_steps'])}{finite}")
-        table.row(name, *cells)
-
-
 def pictures(series, growth, folder):
     fig, (ax,) = panels(1, 1, (7, 4))
     for name in (name for name, drag in series if drag is None):
@@ -274,7 +247,7 @@ def main():
     options = parser.parse_args()
     groups = (
         *(overflow, stability, long_times, kepler, encounters, infalls, chaos),
-        *(singular_damping, non_smooth, broken),
+        *(singular_damping, non_smooth),
     )
     out = {}
     for group in groups:

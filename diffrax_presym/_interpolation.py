@@ -42,6 +42,9 @@ class HermiteInterpolation(dfx.AbstractLocalInterpolation):
         return jtu.tree_map(lambda *x: _hermite(cast_to(s, x[0]), *x), *ends, *inner)
 
 
+HermiteInterpolation.__init__.__doc__ = "**Arguments:** its fields, if any."
+
+
 @functools.cache
 def inner_points(number: int) -> np.ndarray:
     """The points of a step, as fractions, of which Hermite interpolation uses values

@@ -21,16 +21,6 @@ from ._scheme._moves import Drift as Drift, Enter as Enter, Kick as Kick
 from ._system._base import AbstractSystem as AbstractSystem
 from ._system._bound import System as System
 from ._system._kinetic import AbstractKinetic as AbstractKinetic
-from ._system._manifolds import AbstractManifold as _AbstractManifold
 from ._system._mirror import AbstractMirrorMap as AbstractMirrorMap
 from ._system._potential import AbstractPotential as AbstractPotential
 from ._system._split import AbstractSplit as AbstractSplit
-
-
-# Equinox writes their `__init__`, which is documented here.
-for _class in (
-    *(AbstractFriction, AbstractKinetic, AbstractLogScale, _AbstractManifold),
-    *(AbstractMirrorMap, AbstractMove, AbstractPotential, AbstractPresymplecticSolver),
-    *(AbstractSplit, AbstractSystem, HermiteInterpolation, System),
-):
-    _class.__init__.__doc__ = "**Arguments:** its fields, if any."

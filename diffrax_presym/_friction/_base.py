@@ -87,3 +87,6 @@ class AbstractFriction(eqx.Module):
     @abc.abstractmethod
     def force(self, t: Time, q: PyTree, p: PyTree, v: PyTree, args: PyTree) -> PyTree:
         """The force of the friction on momenta `p` and velocities `v`."""
+
+
+AbstractFriction.__init__.__doc__ = "**Arguments:** its fields, if any."

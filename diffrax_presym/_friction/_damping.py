@@ -187,6 +187,9 @@ class SumOfDampings(AbstractDamping):
     terms: tuple[tuple[AbstractLogScale, Any], ...]
 
 
+SumOfDampings.__init__.__doc__ = "**Arguments:** its fields, if any."
+
+
 _FRICTION = "`friction`"
 _OF_PLACE = (
     " For a rate that depends on place write `PositionDamping(rate)`, for any other "

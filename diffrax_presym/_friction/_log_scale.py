@@ -74,6 +74,9 @@ class AbstractLogScale(eqx.Module):
         return None
 
 
+AbstractLogScale.__init__.__doc__ = "**Arguments:** its fields, if any."
+
+
 Terms = Sequence[tuple[AbstractLogScale, Array]]
 
 

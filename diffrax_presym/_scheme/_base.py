@@ -139,6 +139,9 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver):
         return terms.vf(t0, y0, args)
 
 
+AbstractPresymplecticSolver.__init__.__doc__ = "**Arguments:** its fields, if any."
+
+
 def advance(
     scheme: Scheme, system: System, span: Span, start: Point, data: PyTree = None
 ) -> tuple[Point, Result]:

@@ -91,6 +91,9 @@ class AbstractMove(eqx.Module):
         return type(self).prepare is AbstractMove.prepare
 
 
+AbstractMove.__init__.__doc__ = "**Arguments:** its fields, if any."
+
+
 class Inverse(AbstractMove):
     """The inverse of a move, as a move."""
 

@@ -230,6 +230,9 @@ class AbstractSystem(dfx.AbstractTerm):
         return q, self.velocity(t, q, p, args)
 
 
+AbstractSystem.__init__.__doc__ = "**Arguments:** its fields, if any."
+
+
 @eqx.filter_jit  # Outside of a solve, it would be compiled again by each call.
 def _momentum(system: AbstractSystem, t: Time, y: tuple[Q, Q], args: PyTree) -> P:
     q, v = y

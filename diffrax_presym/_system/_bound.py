@@ -146,6 +146,9 @@ class System(eqx.Module):
         )
 
 
+System.__init__.__doc__ = "**Arguments:** its fields, if any."
+
+
 def bind(terms: PyTree, args: PyTree, y: State) -> System:
     """The system of the term that `diffeqsolve` passes to a solver."""
     term, direction = unwrap(terms)

@@ -84,6 +84,9 @@ class AbstractKinetic(eqx.Module):
         """The kinetic energy `T_s(p) = exp(-2s) T(exp(s) p)`, without overflow."""
 
 
+AbstractKinetic.__init__.__doc__ = "**Arguments:** its fields, if any."
+
+
 _OF_POSITIONS = (
     " For a mass matrix that depends on the positions write `LagrangianSystem`."
 )

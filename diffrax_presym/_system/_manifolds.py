@@ -52,6 +52,9 @@ class AbstractManifold(eqx.Module):
         return q
 
 
+AbstractManifold.__init__.__doc__ = "**Arguments:** its fields, if any."
+
+
 class Euclidean(AbstractManifold):
     """Flat space, as a factor of a product."""
 

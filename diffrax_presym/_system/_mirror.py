@@ -58,6 +58,9 @@ class AbstractMirrorMap(eqx.Module):
         return p
 
 
+AbstractMirrorMap.__init__.__doc__ = "**Arguments:** its fields, if any."
+
+
 class EuclideanMirror(AbstractMirrorMap):
     """The mirror map `h(q) = q · M q / 2`, with a linear `∇h`.
 

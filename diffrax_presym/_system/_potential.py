@@ -33,6 +33,9 @@ class AbstractPotential(eqx.Module):
         """The force `-∂V / ∂q`."""
 
 
+AbstractPotential.__init__.__doc__ = "**Arguments:** its fields, if any."
+
+
 class QuadraticPotential(AbstractPotential):
     """The potential energy `V(q) = q · K q / 2` of linear springs.
 

@@ -94,3 +94,6 @@ class AbstractSplit(eqx.Module):
         """The flow of the other part at fixed time, over a length `h`. By default that
         of a force that does not depend on the momentum."""
         return system.add(y, (None, tree.scale(h, force)))
+
+
+AbstractSplit.__init__.__doc__ = "**Arguments:** its fields, if any."
