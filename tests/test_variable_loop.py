@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 from helpers import assert_close
-from variable import control, DISTANCE, last, LEAPFROG, solve, succeeds, Y0
+from variable import control, DISTANCE, KEPLER, last, LEAPFROG, solve, succeeds, Y0
 
 import diffrax_presym as dps
 
@@ -175,3 +175,41 @@ def test_a_step_for_a_tolerance():
     )
     error = np.abs(np.hstack(sol.ys) - exact.y.T) / (1e-7 + 1e-7 * np.abs(exact.y.T))
     assert 0.05 < np.max(error) < 1.5
+
+
+@pytest.mark.parametrize("adjoint", [OWN, dfx.RecursiveCheckpointAdjoint()], ids=str)
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_solve_goes_back_from_an_end_inside_of_a_step(adjoint, sign):
+    step, saveat = control(0.2, KEPLER), dfx.SaveAt(steps=True, controller_state=True)
+    run = partial(solve, step, dps.BlanesMoanRKN4(), adjoint=adjoint, saveat=saveat)
+    t1, most = sign * 3.7, 100
+    there = run(0.0, t1, Y0, max_steps=most)
+    n = int(there.stats["num_steps"])
+    h = np.diff(there.ts[:n])
+    # Cut off by more than steps change.
+    assert abs(h[-1]) < 0.95 * abs(step.step_size(there.controller_state))
+    y1 = jax.tree.map(lambda y: y[n - 1], there.ys)
+    state = step.reverse(jnp.asarray(t1), y1, None, there.controller_state)
+    back = run(
+        *(t1, 0.0, y1), dt0=-jnp.asarray(h[-1]), controller_state=state, max_steps=most
+    )
+    assert_close(back.ts[: n - 1], there.ts[: n - 1][::-1], 1e-9)
+    rows = lambda ys, which: jax.tree.map(lambda y: y[which], ys)
+    before, after = slice(n - 2, None, -1), slice(0, n - 1)
+    assert_close(rows(back.ys, after), rows(there.ys, before), 1e-9)
+    assert_close(rows(back.ys, n - 1), Y0, 1e-9)
+
+    def end(p, adjoint):
+        options: Any = dict(dt0=-jnp.asarray(h[-1]), controller_state=state)
+        y = y1[0], p * y1[1]
+        sol = solve(
+            *(step, dps.BlanesMoanRKN4(), t1, 0.0, y),
+            **(options | dict(adjoint=adjoint, max_steps=most)),
+        )
+        return jnp.sum(sol.ys[0])
+
+    found, wanted = (jax.grad(end)(1.0, x) for x in (adjoint, OWN))
+    d = 1e-6
+    slope = (end(1 + d, adjoint) - end(1 - d, adjoint)) / (2 * d)
+    assert found == pytest.approx(float(wanted), rel=1e-6)
+    assert found == pytest.approx(float(slope), rel=1e-5)

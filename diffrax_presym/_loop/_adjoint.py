@@ -131,7 +131,7 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
             carry = lax.cond(made_jump, restart, lambda: carry)
         subs, structure = private.flatten_subs(saveat)
         if isinstance(stepsize_controller, StepDensityController):
-            steps = VariableSteps(t0, t1, stepsize_controller)
+            steps = VariableSteps(t0, t1, stepsize_controller, dt0)
         else:
             steps = Steps(stepsize_controller, t0, t1, dt0)
         problem = Problem(

@@ -40,6 +40,7 @@ class VariableSteps(AbstractSteps):
     t0: Float[Array, ""]
     t1: Float[Array, ""]
     controller: StepDensityController
+    first: Float[Array, ""] | None  # the length of the first step, if it is given
     are_known: ClassVar[bool] = False
 
     @property
@@ -56,6 +57,11 @@ class VariableSteps(AbstractSteps):
     def _clock(self, point: Point) -> Clock:
         return point[1][1]
 
+    def _length(self, n: Array, control: Array) -> Float[Array, ""]:
+        """Of a step that is not cut off."""
+        h = self.controller.step_size(control)
+        return h if self.first is None else jnp.where(n == 0, self.first, h)
+
     def time(self, point: Point) -> tree.Sum:
         return self._clock(point).t
 
@@ -65,7 +71,7 @@ class VariableSteps(AbstractSteps):
     def end(self, n, point):
         # The last one is cut off at the end of the solve.
         t, control = self._clock(point)
-        end = (t + self.controller.step_size(control)).value
+        end = (t + self._length(n, control)).value
         largest = jnp.maximum(abs(self.t0), abs(self.t1))
         rounding = 4 * float(jnp.finfo(end.dtype).eps) * largest
         return jnp.where(end > self.t1 - rounding, self.t1, end)
@@ -123,7 +129,7 @@ class VariableSteps(AbstractSteps):
 
     def step(self, scheme, system, n, point, data):
         (y, (carry, (t, control))), end = point, self.end(n, point)
-        h, begin, is_last = self.controller.step_size(control), t.value, end >= self.t1
+        h, begin, is_last = self._length(n, control), t.value, end >= self.t1
         t1 = _exact(self.t1)
         h = jnp.where(is_last, t1 - t, h)
         t = tree.where(is_last, t1, t + h)
@@ -139,7 +145,7 @@ class VariableSteps(AbstractSteps):
         # But for one that was cut off.
         y, (carry, (t, control)) = point
         control = self.controller.reverse(t.value, y, system.args, control)
-        h = self.controller.step_size(control)
+        h = self._length(n, control)
         begin = t + -h
         span = Span(*map(system.time, (begin.value, t.value, h)))
         data = prepare(scheme.moves, system, span, backward=True)

@@ -160,6 +160,33 @@ class StepDensityController(dfx.AbstractStepSizeController):
     def reverse(self, t, y, args, controller_state):
         """The `controller_state` for a solve back along the same steps.
 
+        The last step was cut off at `t1`, and is the first one back: pass its length
+        too, as `dt0`.
+
+        !!! example
+
+            ```python
+            weight = lambda t, q, args: -1 / jnp.linalg.norm(q)
+            system = MechanicalSystem(QuadraticKinetic(), weight)
+            controller = StepDensityController(0.2, system)
+            options = dict(
+                stepsize_controller=controller,
+                saveat=SaveAt(steps=True, controller_state=True),
+                adjoint=FixedStepAdjoint(),
+                max_steps=200,
+            )
+            y0 = jnp.array([1.5, 0.0]), jnp.array([0.0, 0.6])
+            sol = diffeqsolve(system, Strang(), 0.0, 5.0, None, y0, **options)
+            n = sol.stats["num_steps"]
+            t1, y1 = sol.ts[n - 1], jax.tree.map(lambda y: y[n - 1], sol.ys)
+            state = controller.reverse(t1, y1, None, sol.controller_state)
+            back = diffeqsolve(
+                *(system, Strang(), t1, 0.0, sol.ts[n - 2] - t1, y1),
+                controller_state=state,
+                **options,
+            )
+            ```
+
         **Arguments:**
 
         - `t`, `y`: the time and state at the end of the solve.
