@@ -210,3 +210,37 @@ def test_the_last_saved_time_where_steps_are_short():
 
     gradient = jax.vmap(jax.grad(saved))(jnp.array([0.5, 1.0]))
     assert jnp.all(jnp.isfinite(gradient))
+
+
+@pytest.mark.parametrize("adjoint", [REVERSIBLE, FIXED_STEP], ids=str)
+@pytest.mark.parametrize("varies", [False, True])
+def test_a_member_that_failed_and_is_not_used_adds_nothing(adjoint, varies):
+    """To the gradient by a parameter that members share, alone and in a batch."""
+
+    def loss(k, gamma):
+        potential = lambda t, q, args: -k * jnp.sum(jnp.cos(q))
+        system = dps.MechanicalSystem(
+            dps.QuadraticKinetic(), potential, dps.ConstantDamping(gamma)
+        )
+        options: Any = dict(throw=False, max_steps=64, adjoint=adjoint)
+        if varies:
+            density = lambda t, y, args: 1 / (1 + jnp.sum(y[1] ** 2))
+            options["stepsize_controller"] = dps.StepDensityController(0.5, density)
+        sol: Any = dfx.diffeqsolve(
+            *(system, dps.TunedRKN6(), 0.0, 9.0, None if varies else 0.5),
+            y0=(jnp.ones(1), k * jnp.ones(1)),
+            saveat=dfx.SaveAt(ts=jnp.linspace(0.7, 8.7, 9), t1=True),
+            **options,
+        )
+        good = sol.result == dfx.RESULTS.successful
+        q = jnp.where(good, sol.ys[0], 0.0)
+        return jnp.sum(q**2), good
+
+    rates = jnp.array([0.1, -300.0, 0.3])
+    slope = jax.jit(jax.grad(loss, has_aux=True))
+    each = [slope(1.0, x) for x in rates]
+    assert [bool(good) for _, good in each] == [True, False, True]
+    assert each[1][0] == 0.0
+    total = lambda k: jnp.sum(jax.vmap(loss, (None, 0))(k, rates)[0])
+    found = jax.jit(jax.grad(total))(1.0)
+    np.testing.assert_allclose(found, sum(x for x, _ in each), 1e-9)

@@ -1,5 +1,6 @@
 """The loop of the package, as an adjoint of Diffrax."""
 
+from functools import reduce
 from typing import Literal
 
 import diffrax as dfx
@@ -305,9 +306,13 @@ def _solve_bwd(trace, bars, perturbed, inputs, way: Reversal | Checkpoints):
     bars = saved_bars, carry_bar, pulls(problem)
     backward = Backward(problem, trace, perturbed[0].functions, *bars)
     at = way.pull_back(backward)
+    # What is not used of a solve that failed, as a member of a batch, adds nothing.
+    used = [jnp.any(x != 0) for x in jtu.tree_leaves((saved_bars, carry_bar))]
+    used = reduce(jnp.logical_or, used, jnp.asarray(False))
+    found = jtu.tree_map(lambda x: jnp.where(used, x, 0), (at.gradient, at.bar))
     none = lambda tree: jtu.tree_map(lambda _: None, tree)
     where = lambda x: (x.functions, x.start)
-    gradient = eqx.tree_at(where, none(problem), (at.gradient, at.bar), is_leaf=_none)
+    gradient = eqx.tree_at(where, none(problem), found, is_leaf=_none)
     return gradient, none(buffers)
 
 
