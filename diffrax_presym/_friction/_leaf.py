@@ -12,6 +12,7 @@ from .._forms import matvec
 from .._numbers import as_time, cast_to, Scalar, Time
 from ._exponential import exponential_products, exponentials
 from ._log_scale import AbstractLogScale, by_quadrature, Effect, increment
+from ._near_singularity import by_powers
 
 
 class EntryFriction(eqx.Module):
@@ -38,7 +39,8 @@ class EntryFriction(eqx.Module):
         if len(self.terms) == 1:
             ((law, rate),) = self.terms
             return law.effect(rate, t, h, order)
-        return by_quadrature(self.terms, t, h, order)
+        effect = by_powers(self.terms, t, h, order)
+        return by_quadrature(self.terms, t, h, order) if effect is None else effect
 
     def fix(self, effects: Sequence[Effect]) -> Sequence[Effect]:
         return effects

@@ -89,11 +89,17 @@ def increment(terms: Terms, t: Time, h: Time) -> Array:
 def by_quadrature(terms: Terms, t: Time, h: Time, order: int) -> Effect:
     """What friction of several log scales with factors does from `t` to `t + h`."""
     nodes, weights = gauss_legendre(h, order)
+    both = decays(terms, t, h, nodes)
+    integrals = (jnp.tensordot(weights, x, 1) for x in both)
+    return Effect(expm1(-increment(terms, t, h)), *integrals)
+
+
+def decays(terms: Terms, t: Time, h: Time, nodes: Array) -> tuple[Array, Array]:
+    """Of a momentum from the start of a span to some times in it, and from these to its
+    end."""
     decayed = jax.vmap(lambda s: jnp.exp(-increment(terms, t, s)))(nodes)
     left = jax.vmap(lambda s: jnp.exp(-increment(terms, t + s, h - s)))(nodes)
-    weights = jnp.expand_dims(weights, range(1, left.ndim))
-    integrals = (jnp.sum(weights * x, axis=0) for x in (decayed, left))
-    return Effect(expm1(-increment(terms, t, h)), *integrals)
+    return decayed, left
 
 
 class LinearScale(AbstractLogScale):
@@ -136,23 +142,23 @@ class Logarithm(AbstractLogScale):
         t = as_time(t)
         return t if self.shift is None else t + cast_to(self.shift, t)
 
-    def _since(self, t: Time) -> tuple[Bool[Array, "..."], Scalar]:
+    def since(self, t: Time) -> tuple[Bool[Array, "..."], Scalar]:
         """Whether `t` is the singularity, and the time since, or 1 there."""
         since = self._after(t)
         return since == 0, jnp.where(since == 0, 1, since)
 
     def increment(self, t: Time, h: Time) -> Scalar:
-        singular, since = self._since(t)
+        singular, since = self.since(t)
         return jnp.where(singular, _ALL_LOST, jnp.log1p(as_time(h) / since))
 
     def rate(self, t: Time) -> Scalar:
-        singular, since = self._since(t)
+        singular, since = self.since(t)
         return jnp.where(singular, jnp.inf, 1 / since)
 
     def effect(self, rate: Array, t: Time, h: Time, order: int) -> Effect:
         # With the time tau since the singularity, at the start and at the end, a
         # momentum decays by (tau / tau_end)^rate.
-        singular, since = self._since(t)
+        singular, since = self.since(t)
         start = jnp.where(singular, 0, since)
         x, h, rate = self.increment(t, h), as_time(h), cast_to(rate, since)
         carried = start * x * expm1_and_ratio((1 - rate) * x)[1]
@@ -162,7 +168,7 @@ class Logarithm(AbstractLogScale):
         return Effect(expm1(-rate * x), carried, responded)
 
     def is_singular(self, t: Time) -> Bool[Array, ""]:
-        return jnp.any(self._since(t)[0])
+        return jnp.any(self.since(t)[0])
 
 
 class Power(AbstractLogScale):
@@ -187,8 +193,10 @@ class Power(AbstractLogScale):
         h = as_time(h)
         grown = since**delta * expm1(delta * jnp.log1p(h / since))
         before = jnp.where(delta == 0, 1, here ** jnp.maximum(delta, 1))
-        first = jnp.where(zero, here + h, 1) ** delta - before
-        return jnp.where(zero, first, grown)
+        # A root has no derivative at zero.
+        some = zero & ((here + h != 0) | (delta >= 1))
+        first = jnp.where(some, here + h, 1) ** delta - before
+        return jnp.where(some, first, jnp.where(zero, 0, grown))
 
     def rate(self, t: Time) -> Scalar:
         zero, here, since, delta = self._parameters(t)
