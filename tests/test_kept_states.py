@@ -104,6 +104,27 @@ def test_gaps_after_the_end(adjoint, varies, steps, max_steps):
     assert_close(with_gap, slope(q0, ts), 1e-12)
 
 
+@pytest.mark.parametrize("adjoint", [REVERSIBLE, FIXED_STEP])
+@pytest.mark.parametrize("varies", [False, True])
+def test_gaps_in_what_is_a_function_of_time(adjoint, varies):
+    control = dps.StepDensityController(0.2, lambda t, y, args: 1 / (1 + y[0] @ y[0]))
+    energy = lambda t, y, args: jnp.sin(t) * (jnp.sum(y[0] ** 2) + jnp.sum(y[1]))
+
+    def value(q0, ts):
+        sol: Any = dfx.diffeqsolve(
+            *(pendulum(0.1), LEAPFROG, 0.0, 2.0, None if varies else 0.1),
+            (q0, 0 * q0),
+            stepsize_controller=control if varies else dfx.ConstantStepSize(),
+            saveat=dfx.SaveAt(ts=ts, fn=energy),
+            adjoint=adjoint,
+            max_steps=60,
+        )
+        return jnp.sum(jnp.where(jnp.isfinite(sol.ys), sol.ys, 0) ** 2)
+
+    slope, q0, ts = jax.grad(value), jnp.ones(1), jnp.array([0.4, jnp.nan, 1.0, 1.7])
+    assert_close(slope(q0, ts), slope(q0, ts[jnp.array([0, 2, 3])]), 1e-12)
+
+
 # States that cannot be recomputed.
 
 # States of the last three rates cannot be recomputed between 8 of 1000 kept ones.

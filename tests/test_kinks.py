@@ -6,6 +6,7 @@ import itertools
 from typing import Any
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -102,6 +103,22 @@ def test_steps_between_kinks_keep_the_order(adjoint, t0, t1):
     assert errors[1] < 1e-7 and errors[0] / errors[1] > 4**3.5
     # Four, 14, 19 and seven steps.
     assert sols[0].stats["num_steps"] == 44
+
+
+def test_a_kink_at_the_start_is_none():
+    """Nothing is asked of a force before it, where this one is not defined."""
+    potential = lambda t, q, args: jnp.sum(q**2) / 2 - (t - 1) ** 2.5 * jnp.sum(q)
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), potential)
+    saveat = dfx.SaveAt(ts=jnp.array([1.03, 1.17, 1.4]))
+    solve = lambda times: dfx.diffeqsolve(
+        *(system, RKN4, 1.0, 2.0, 0.05, (jnp.ones(1), jnp.zeros(1))),
+        stepsize_controller=dps.StepsBetween(jnp.array(times)),
+        adjoint=dps.FixedStepAdjoint(),
+        saveat=saveat,
+    )
+    with_start, without = solve([1.0, 1.5]), solve([1.5])
+    assert with_start.result == dfx.RESULTS.successful
+    assert eqx.tree_equal(with_start.ys, without.ys, rtol=1e-13)
 
 
 @pytest.mark.slow

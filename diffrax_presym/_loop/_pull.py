@@ -63,6 +63,9 @@ def _pull_row(
     problem = backward.problem
     rows, bar = problem.rows[i], backward.row(i, int(problem.subs[i].t0) + j, taken)
     row = row_of(rows.each, j)
+    # Of the others nothing may fail of which a gradient takes zero times.
+    here = problem.steps.begin(at.n, at.point)
+    row = row._replace(time=jnp.where(taken, row.time, here))
 
     def pull(shorter: bool):
         def output(functions: Functions, start: Point):

@@ -117,7 +117,7 @@ def _track(problem: Problem, i: int, keep: bool) -> AbstractTrack | None:
         if functions.shorter is not None:
             shorter = partial(problem.between, functions)
         how = functions.end, shorter, output, keep
-        return Timed(problem.steps, rows.time, *how, y, init)
+        return Timed(problem.steps, problem.last, rows.time, *how, y, init)
     if stencils is None:
         value = lambda row, point: saved(row, point)[1:]
         return Track(stops, rows.each, value, (init, jnp.asarray(True)))

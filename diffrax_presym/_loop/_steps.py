@@ -153,7 +153,10 @@ class Steps(AbstractSteps):
 
     @property
     def kinks(self):
-        return None if len(self.starts) == 1 else self.first[1:]
+        if len(self.starts) == 1:
+            return None
+        # Not at the start of the solve, before which nothing is defined.
+        return jnp.where(self.first[1:] > 0, self.first[1:], -1)
 
     def _part(self, n: Int[Array, "..."]) -> Any:
         if len(self.starts) == 1:

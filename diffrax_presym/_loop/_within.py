@@ -81,6 +81,7 @@ class Timed(AbstractTrack):
     """Values at given times, wherever these are in the steps."""
 
     steps: VariableSteps
+    last: Int[Array, ""]  # the most steps
     times: Float[Array, " rows"]
     # `None` if all values within steps are shorter steps.
     end: Callable[[Array, Point], tuple[End, Bool[Array, ""]]] | None
@@ -126,13 +127,16 @@ class Timed(AbstractTrack):
     ) -> _Collected:
         now, ends, smooth = self.steps.begin(n, point), state.ends, state.smooth
         within = lambda j: here & self.steps.is_within(self._time(j), n, point)
-        waits = lambda j: within(j) & smooth & (self._time(j) > now)
+        # The end of a step before moves with the state, unlike the ends of the solve.
+        moves = (n > 0) & (n < self.last) & ~self.steps.ended(n, point)
+        after = lambda t: (t > now) | ((t == now) & moves)
+        waits = lambda j: within(j) & smooth & after(self._time(j))
         ready = lambda j: within(j) & ~waits(j)
 
         def save(x: tuple[Array, PyTree]) -> tuple[Array, PyTree]:
             j, rows = x
             own, t, kept = ready(j), self._time(j), None
-            inside, past = t > now, (t < now) & (state.next == n)
+            inside, past = after(t), (t < now) & (state.next == n)
             y = point[0]
             if (shorter := self.shorter) is not None:
                 time = jnp.where(inside, t, now)
