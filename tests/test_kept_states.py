@@ -265,3 +265,21 @@ def test_a_member_that_failed_and_is_not_used_adds_nothing(adjoint, varies):
     total = lambda k: jnp.sum(jax.vmap(loss, (None, 0))(k, rates)[0])
     found = jax.jit(jax.grad(total))(1.0)
     np.testing.assert_allclose(found, sum(x for x, _ in each), 1e-9)
+
+
+def test_few_large_states_are_kept_by_default():
+    def loss(q):
+        start = q, jnp.zeros_like(q)
+        sol: Any = dfx.diffeqsolve(
+            *(pendulum(0.1), LEAPFROG, 0.0, 1.0, 0.1, start),
+            adjoint=dps.FixedStepAdjoint(),
+            max_steps=None,
+        )
+        return jnp.sum(sol.ys[0])
+
+    def states(n):
+        q = jax.ShapeDtypeStruct((n,), float)
+        memory: Any = jax.jit(jax.grad(loss)).lower(q).compile().memory_analysis()
+        return memory.temp_size_in_bytes / (16 * n)
+
+    assert states(10**6) < 40 and states(10**3) > 128

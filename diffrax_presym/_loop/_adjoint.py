@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._checks import as_positive
-from .._scheme._base import AbstractPresymplecticSolver, Scheme
+from .._scheme._base import AbstractPresymplecticSolver, Point, Scheme
 from .._step_size._density import StepDensityController
 from .._system._bound import bind
 from . import _diffrax as private
@@ -23,6 +23,10 @@ from ._pull import pulls
 from ._run import run, saved_rows
 from ._steps import Steps, StepsBetween
 from ._variable import VariableSteps
+
+
+# Of the states that are kept by default.
+_MOST_KEPT, _FEWEST_KEPT, _MOST_BYTES = 128, 16, 2**24
 
 
 class FixedStepAdjoint(dfx.AbstractAdjoint):
@@ -125,7 +129,7 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         _check(solver, stepsize_controller, *unsupported)
         scheme = solver.scheme(system)
         _check_history(solver, scheme, stepsize_controller)
-        way = self._way(solver, scheme, max_steps, throw)
+        way = self._way(solver, scheme, (y, carry), max_steps, throw)
         if made_jump is not False:
             # The solver state is stale, and is recomputed before the first step.
             restart = lambda: scheme.start(system, system.time(t0), y)
@@ -150,7 +154,7 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         return final, about
 
     def _way(
-        self, solver, scheme: Scheme, max_steps: int | None, throw: bool
+        self, solver, scheme: Scheme, start: Point, max_steps: int | None, throw: bool
     ) -> "Reversal | Checkpoints":
         """How the gradient is taken; an error if the scheme does not allow it."""
         if self.gradient == "reversal" and not scheme.is_invertible:
@@ -161,7 +165,12 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         number = self.checkpoints
         if scheme.is_invertible and self.gradient != "checkpoints":
             raises = self.throw if self.throw is not None or throw else False
-            return Reversal(128 if number is None else number, self.tol, raises)
+            if number is None:
+                # As large memory is slow to get, also where few of them are used.
+                arrays = map(jnp.asarray, jtu.tree_leaves(start))
+                room = _MOST_BYTES // sum(max(x.nbytes, 1) for x in arrays)
+                number = min(max(room, _FEWEST_KEPT), _MOST_KEPT)
+            return Reversal(number, self.tol, raises)
         return Checkpoints(max_steps, number)
 
 
@@ -170,8 +179,9 @@ FixedStepAdjoint.__init__.__doc__ = """**Arguments:**
 - `gradient`: `"reversal"`, by running the scheme backwards, or `"checkpoints"`, by
     computing steps again. Defaults to `None`: by reversal if the scheme has an inverse.
 - `checkpoints`: the maximum number of states to keep besides the two ends, which
-    determines the memory. Defaults to `None`: for reversal 128; for checkpoints the
-    square root of `max_steps`, with which the memory is least.
+    determines the memory. Defaults to `None`: for reversal 128, or of a large state
+    as many as need 16 MB, but at least 16; for checkpoints the square root of
+    `max_steps`, with which the memory is least.
 - `tol`: the largest error of a state recomputed by reversal, relative to the size of
     the state. Defaults to the precision of the state to the power 2/3: 4e-11 in
     `float64`, 2e-5 in `float32`.
