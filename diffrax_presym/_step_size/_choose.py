@@ -53,10 +53,18 @@ class ChosenStep(NamedTuple):
             "times, write `stepsize_controller=StepsBetween(times)`; where a force "
             "jumps, end the solve and begin another."
         )
+        limit = (
+            " Steps that are not much longer are unstable: for other parameters, as in "
+            "a fit, choose the step with those of the fastest motion."
+        )
+        # More than by any order of convergence.
+        near = [x for x in self.trials if 0.7 * self.steps <= x.steps < self.steps]
+        unstable = any(x.error > 1e3 for x in near)
         return (
             f"dt0={self.dt0:.6g}, {self.steps} steps, expected error "
             f"{self.error:.2g} of the tolerance. Measured order {order}{scheme}. "
             f"Errors over the tolerance: {trials}.{'' if self.smooth else note}"
+            f"{limit if unstable else ''}"
         )
 
 
