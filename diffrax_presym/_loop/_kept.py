@@ -44,7 +44,8 @@ class Reversal(eqx.Module):
     def places(self, problem: Problem) -> Array:
         """The steps whose starting states are kept, in order; those that are not are
         after the last step."""
-        parts, most, last = -(-problem.last // _APART), self.most + 1, problem.last
+        most, last = self.most + 1, jnp.asarray(problem.last)
+        parts = jnp.asarray(-(-last // _APART))
         if problem.growth is not None:
             # Each part may amplify rounding up to the limit.
             allowed, eps = self.limit(problem.start[0])
