@@ -122,6 +122,11 @@ class LogDamping(AbstractDamping):
     order `γ + 1`, and other schemes order 2. Schemes whose stages extend beyond the
     step, such as `SuzukiYoshida`, must start far enough from there; otherwise the solve
     fails. Backwards in time the momentum is infinite there: end before it.
+
+    Write the infinite part of a rate as this law also if there is more of it, in a list
+    with the rest: its power of time is then exact, where a function alone loses most
+    digits in the first steps. The rate `2 a coth(a t)` is `[LogDamping(2.0), eta]` with
+    `eta = lambda t: 2 * jnp.log(jnp.sinh(a * t) / t)`.
     """
 
     gamma: Numbers
