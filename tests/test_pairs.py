@@ -12,12 +12,12 @@ import pathlib
 from functools import cache, cached_property, partial
 
 import catalogue
+import deliberate_errors
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import mutants
 import numpy as np
 import orders
 import pytest
@@ -308,5 +308,5 @@ def test_the_table_of_orders():
 
 def test_deliberate_errors_apply():
     package = pathlib.Path(dps.__file__).parent
-    for mutant in mutants.MUTANTS:
+    for mutant in deliberate_errors.MUTANTS:
         assert mutant.old in (package / mutant.file).read_text(), mutant.name
