@@ -113,9 +113,9 @@ class Backward(eqx.Module):
             pairs = zip(tracks, at.tracks, strict=True)
             return [track.due(state, at.n) for track, state in pairs]
 
-        def steps(at: BackwardState, stop: Array, going: Array) -> BackwardState:
+        def steps(at: BackwardState, stop: Array, soon: Array) -> BackwardState:
             all_steps = self.problem.steps
-            left = lambda at: all_steps.together(at.n > stop, going)
+            left = lambda at: all_steps.together(at.n > stop, soon)
 
             def back(at: BackwardState) -> BackwardState:
                 # Members of a batch that are done repeat a step that may be undone.
@@ -136,6 +136,7 @@ class Backward(eqx.Module):
             own = reduce(jnp.maximum, wanted, first)
             going = more(at)
             n = -self.problem.steps.common(-own, going)
+            # All stop where one is to: a step back costs more than what is done there.
             at = steps(at, jnp.maximum(n, first), going)
             for i, (track, wanted_step) in enumerate(zip(tracks, wanted, strict=True)):
 

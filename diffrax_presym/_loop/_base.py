@@ -98,9 +98,10 @@ class AbstractSteps(eqx.Module):
         steps are known."""
 
     @abc.abstractmethod
-    def together(self, left: Bool[Array, ""], going: Bool[Array, ""]) -> Array:
+    def together(self, left: Bool[Array, ""], soon: Bool[Array, ""]) -> Array:
         """Whether a member of a batch takes another step, of which some are `left` to
-        its stop: if steps are not known, until a member that is `going` on has none."""
+        its stop: if steps are not known, until those have none that were to stop
+        `soon`, after one step. Otherwise they would wait for all others each time."""
 
     @abc.abstractmethod
     def before(self, stop: Stop, n: Array, point: Point) -> Bool[Array, ""]:

@@ -160,12 +160,12 @@ def _run_steps(problem: Problem, tracks: PyTree) -> tuple[Progress, Array, PyTre
     def unfinished(progress: Progress, stop: Stop) -> Bool[Array, ""]:
         return steps.before(stop, progress.n, progress.point) & good(progress)
 
-    def advance_to(stop: Stop, progress: Progress, going: Any) -> Progress:
+    def advance_to(stop: Stop, progress: Progress, soon: Any) -> Progress:
         if not (cheap_iterations() or can_fail):
             block = lambda x: lax.fori_loop(0, _BLOCK, lambda _, x: step(x), x)
             several = lambda progress: progress.n + _BLOCK <= stop.n
             progress = lax.while_loop(several, block, progress)
-        more = lambda x: steps.together(unfinished(x, stop), going)
+        more = lambda x: steps.together(unfinished(x, stop), soon)
         return lax.while_loop(more, step, progress)
 
     is_track = lambda x: isinstance(x, AbstractTrack)
@@ -180,7 +180,8 @@ def _run_steps(problem: Problem, tracks: PyTree) -> tuple[Progress, Array, PyTre
         first, new = steps.next_stop(wanted, last), []
         # Members of a batch stop together, at the first step where one of them is to.
         common = first._replace(n=steps.common(first.n, going))
-        progress = advance_to(steps.next_stop([common], last), progress, going)
+        soon = going & (common.n == progress.n + 1)
+        progress = advance_to(steps.next_stop([common], last), progress, soon)
         n, point = steps.number(common, progress.n), progress.point
         for track, state, next_stop in zip(flat, states, wanted, strict=True):
             here = steps.at(next_stop, n, point) & (n <= last)

@@ -259,7 +259,7 @@ class Steps(AbstractSteps):
     def common(self, n, going):
         return tree.smallest_member(jnp.where(going, n, MOST_STEPS))
 
-    def together(self, left, going):
+    def together(self, left, soon):
         return left
 
     def before(self, stop, n, point):

@@ -93,8 +93,8 @@ class VariableSteps(AbstractSteps):
     def common(self, n, going):
         return n
 
-    def together(self, left, going):
-        return left & ~tree.any_member(going & ~left)
+    def together(self, left, soon):
+        return left & ~tree.any_member(soon & ~left)
 
     def before(self, stop, n, point):
         left = (n < stop.n) & ~self.ended(n, point)
