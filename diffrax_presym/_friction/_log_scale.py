@@ -89,8 +89,9 @@ def increment(terms: Terms, t: Time, h: Time) -> Array:
 def by_quadrature(terms: Terms, t: Time, h: Time, order: int) -> Effect:
     """What friction of several log scales with factors does from `t` to `t + h`."""
     nodes, weights = gauss_legendre(h, order)
-    both = decays(terms, t, h, nodes)
-    integrals = (jnp.tensordot(weights, x, 1) for x in both)
+    decayed, left = decays(terms, t, h, nodes)
+    weights = jnp.expand_dims(weights, range(1, left.ndim))
+    integrals = (jnp.sum(weights * x, axis=0) for x in (decayed, left))
     return Effect(expm1(-increment(terms, t, h)), *integrals)
 
 

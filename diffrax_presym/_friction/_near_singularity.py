@@ -46,8 +46,12 @@ def by_powers(terms: Terms, t: Time, h: Time, order: int) -> Effect | None:
         rank = max(x.ndim for x in (smooth, power, moment))
         wide = lambda x: x.reshape(len(x), *(1,) * (rank - x.ndim), *x.shape[1:])
         smooth, power, moment = map(wide, (smooth, power, moment))
-        by_nodes = jnp.tensordot(weights, smooth * power, 1)
-        polynomial = jnp.tensordot(cast_to(coefficients, smooth), smooth, 1)
+        # By sums, as XLA on a CPU makes no function of a loop with a product.
+        each = lambda x: jnp.expand_dims(
+            cast_to(x, smooth), range(x.ndim, x.ndim + rank - 1)
+        )
+        by_nodes = jnp.sum(each(weights) * smooth * power, axis=0)
+        polynomial = jnp.sum(each(coefficients) * smooth[None], axis=1)
         return jnp.where(short, by_nodes, jnp.sum(polynomial * moment, axis=0))
 
     integrals = map(integral, smooth, powers, moments)
