@@ -9,7 +9,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .. import _tree as tree
 from .._checks import as_finite
@@ -320,7 +320,9 @@ class Steps(AbstractSteps):
     def without_gradient(self):
         return self
 
-    def locate(self, ts):
+    def locate(
+        self, ts: Float[Array, " times"]
+    ) -> tuple[Int[Array, " times"], Bool[Array, " times"]]:
         """The step at whose start each time is, or the one that it is inside of; and
         whether it is inside.
 

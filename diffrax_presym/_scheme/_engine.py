@@ -105,10 +105,14 @@ class Inverse(AbstractMove):
     def is_autonomous(self, system: System) -> bool:
         return self.move.is_autonomous(system)
 
-    def apply(self, system, span, data, stage):
+    def apply(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         return self.move.undo(system, span, data, stage)
 
-    def undo(self, system, span, data, stage):
+    def undo(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         return self.move.apply(system, span, data, stage)
 
 

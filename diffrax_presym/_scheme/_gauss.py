@@ -18,7 +18,7 @@ from .._numbers import cast_to, State
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, refuse_constrained, Scheme
 from ._collocation import gauss_table, legendre, MAX_STAGES
-from ._engine import AbstractMove, Span
+from ._engine import AbstractMove, Outcome, Span, StepState
 from ._gauss_solve import (
     by_root_finder,
     fixed_point,
@@ -71,7 +71,9 @@ class Collocation(AbstractMove):
     def is_autonomous(self, system: System) -> bool:
         return system.prepares_once
 
-    def apply(self, system, span, data, stage):
+    def apply(
+        self, system: System, span: Span, data: Frames | None, stage: StepState
+    ) -> Outcome:
         y, carry = stage
         sums = tree.to_sums(y, carry.lost)
         values, lost = system.values(sums), tree.rounding_errors(sums)

@@ -21,7 +21,9 @@ class Enter(AbstractMove):
     kind: str = eqx.field(static=True)
     keeps_manifold: ClassVar[bool] = True
 
-    def apply(self, system, span, data, stage):
+    def apply(
+        self, system: System, span: Span, data: None, stage: StepState
+    ) -> Outcome:
         y, carry = stage
         return (system.split(self.kind).enter(system, span.t0, y), carry), None
 
@@ -44,7 +46,9 @@ class Drift(AbstractMove):
     def is_autonomous(self, system: System) -> bool:
         return system.prepares_once
 
-    def apply(self, system, span, data, stage):
+    def apply(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         (y, carry), split = stage, system.split(self.kind)
         y, result = split.attempt(system, span.t0, span.h, data, y)
         return (y, carry), result
@@ -64,7 +68,9 @@ class Kick(AbstractMove):
     known: bool = eqx.field(static=True, default=False)
     keeps_manifold: ClassVar[bool] = True
 
-    def apply(self, system, span, data, stage):
+    def apply(
+        self, system: System, span: Span, data: None, stage: StepState
+    ) -> Outcome:
         if not self.known:
             return self.undo(system, span, data, stage)
         (y, force), split = stage, system.split(self.kind)
@@ -102,13 +108,17 @@ class FrozenDrift(AbstractMove):
     def is_autonomous(self, system: System) -> bool:
         return system.prepares_once
 
-    def apply(self, system, span, data, stage):
+    def apply(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         y, carry = stage
         velocity = system.velocity(span.t0, y)
         y = system.add(y, (tree.scale(span.h, velocity), None))
         return (system.decay(data, y), carry), None
 
-    def undo(self, system, span, data, stage):
+    def undo(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         y, carry = stage
         y = system.decay(data, y)
         velocity = system.velocity(span.t1, y)
@@ -123,7 +133,9 @@ class ToSums(AbstractMove):
 
     keeps_manifold: ClassVar[bool] = True
 
-    def apply(self, system, span, data, stage):
+    def apply(
+        self, system: System, span: Span, data: None, stage: StepState
+    ) -> Outcome:
         y, (carry, lost) = stage
         return (tree.to_sums(y, lost), carry), None
 

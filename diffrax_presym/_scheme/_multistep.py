@@ -19,7 +19,7 @@ from .._numbers import cast_to, State
 from .._results import MULTISTEP_UNSTABLE, OTHER_HISTORY
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, Scheme
-from ._engine import AbstractMove, forward, prepare, Span
+from ._engine import AbstractMove, forward, Outcome, prepare, Span, StepState
 from ._find_split import find_split
 from ._splitting import BlanesCasasRKN8
 
@@ -97,7 +97,9 @@ class Multistep(AbstractMove):
     def is_autonomous(self, system: System) -> bool:
         return system.prepares_once
 
-    def apply(self, system, span, data, stage):
+    def apply(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         (y, old), (t0, t1, h), table = stage, span, _TABLES[self.order]
         (decay, data), split = data, system.split("shared")
         # From the frame of the start of the step to that of its end.
@@ -136,7 +138,9 @@ class Multistep(AbstractMove):
         new = _Carry(steps + 1, length, momentum, force, filter)
         return ((q, p), new), None
 
-    def undo(self, system, span, data, stage):
+    def undo(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         raise NotImplementedError  # The history before a change of length is lost.
 
     def _momentum(

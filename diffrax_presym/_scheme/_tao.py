@@ -29,7 +29,9 @@ class Exchange(AbstractMove):
     second: bool = eqx.field(static=True, default=False)
     known: bool = eqx.field(static=True, default=False)
 
-    def apply(self, system, span, data, stage):
+    def apply(
+        self, system: System, span: Span, data: None, stage: StepState
+    ) -> Outcome:
         if not self.known:
             # The map does not change the arguments of its field: it is its own inverse.
             return self.undo(system, span, data, stage)
@@ -62,7 +64,9 @@ class MoveFrames(AbstractMove):
     def is_autonomous(self, system: System) -> bool:
         return system.prepares_once
 
-    def apply(self, system, span, data, stage):
+    def apply(
+        self, system: System, span: Span, data: PyTree, stage: StepState
+    ) -> Outcome:
         y, (copy, field) = stage
         return (system.decay(data, y), (system.decay(data, copy), field)), None
 
@@ -83,7 +87,9 @@ class Coupling(AbstractMove):
     def is_autonomous(self, system: System) -> bool:
         return True
 
-    def apply(self, system, span, data, stage):
+    def apply(
+        self, system: System, span: Span, data: Array, stage: StepState
+    ) -> Outcome:
         y, (copy, field) = stage
         half = tree.scale(0.5, tree.sub(y, copy))
         change = tree.add_scaled(rotate(data, half), -1, half)

@@ -3,7 +3,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
-from jaxtyping import PyTree
+from jaxtyping import Array, Bool, PyTree
 
 from .. import _tree as tree
 from .._checks import check_callable, scalar_fn
@@ -132,6 +132,8 @@ class BregmanHamiltonian(AbstractSystem):
         slope = jax.grad(objective, argnums=1)(t, q, args)
         return tree.scale(-self.scaling.strength(t), self.mirror_map.project(slope))
 
-    def is_valid(self, t, q, p, args=None):
+    def is_valid(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> Bool[Array, ""] | None:
         valid = self.mirror_map.contains(q) & tree.all_finite(p)
         return valid & self.scaling.is_valid(t)

@@ -137,7 +137,9 @@ class ConstrainedSystem(AbstractSystem):
     def check_state(self, y: PyTree) -> None:
         self.system.check_state(y)
 
-    def add_forces(self, force, external, t, q, p, v, args):
+    def add_forces(
+        self, force: P, external: Callable | None, t: Time, q: Q, p: P, v: Q, args
+    ) -> P:
         return self.system.add_forces(force, external, t, q, p, v, args)
 
     def energy(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar:
@@ -201,7 +203,9 @@ class ConstrainedSystem(AbstractSystem):
         x = solve(linear, miss, self.linear_solver)
         return tree.scale(-1, self.normal(t, q, args)(x))
 
-    def velocity_and_force(self, t, q, p, args=None):
+    def velocity_and_force(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> tuple[Q, P]:
         t, friction = as_time(t), self.fit_friction(p)
         v, force = self.system.velocity_and_force(t, q, p, args)
         net = force if friction is None else friction.net_force(t, force, p)

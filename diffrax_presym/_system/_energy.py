@@ -87,7 +87,9 @@ class Hamiltonian(AbstractSystem):
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         return self.velocity_and_force(t, q, p, args)[1]
 
-    def velocity_and_force(self, t, q, p, args=None):
+    def velocity_and_force(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> tuple[Q, P]:
         slope, velocity = jax.grad(self.energy, argnums=(1, 2))(t, q, p, args)
         force, state = tree.scale(-1, slope), (t, q, p, velocity, args)
         return velocity, self.add_forces(force, self.external, *state)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
+from jaxtyping import Array, Bool, PyTree
 
 from .. import _tree as tree
 from .._checks import check_callable, describe, scalar_fn
@@ -123,7 +123,9 @@ class LagrangianSystem(AbstractSystem):
             )
         return cast_to(M, q)
 
-    def from_velocity(self, t, y, args=None):
+    def from_velocity(
+        self, t: Time, y: tuple[Vector, Vector], args: PyTree = None
+    ) -> tuple[Vector, Vector]:
         """The state `(q, p)`, with `p = M(t, q) v`, of positions and velocities.
 
         **Arguments:**
@@ -148,7 +150,9 @@ class LagrangianSystem(AbstractSystem):
     def force(self, t: Time, q: Vector, p: Vector, args: PyTree = None) -> Vector:
         return self.velocity_and_force(t, q, p, args)[1]
 
-    def force_at(self, t, q, p, v, args=None):
+    def force_at(
+        self, t: Time, q: Vector, p: Vector, v: Vector, args: PyTree = None
+    ) -> Vector:
         if len(q) <= WRITTEN_OUT:
             # The compiler shares what this has in common with another velocity here.
             v = self.velocity(t, q, p, args)
@@ -163,7 +167,9 @@ class LagrangianSystem(AbstractSystem):
     def _potential(self, t, q, args):
         return cast_to(scalar_fn(self.potential, "The potential")(t, q, args), q)
 
-    def is_valid(self, t, q, p, args=None):
+    def is_valid(
+        self, t: Time, q: Vector, p: Vector, args: PyTree = None
+    ) -> Bool[Array, ""]:
         M = self.mass_matrix(t, q, args)
         rounding = 1e3 * float(jnp.finfo(M.dtype).eps) * jnp.max(jnp.abs(M), initial=0)
         symmetric = jnp.all(jnp.abs(M - M.T) <= rounding)

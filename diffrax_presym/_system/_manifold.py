@@ -205,12 +205,16 @@ class ManifoldSystem(AbstractSystem):
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         return self.velocity_and_force(t, q, p, args)[1]
 
-    def velocity_and_force(self, t, q, p, args=None):
+    def velocity_and_force(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> tuple[Q, P]:
         velocity, force = self.pair(self._each("rates", q, p))
         force = tree.add(force, self.kick(t, q, p, args))
         return velocity, self.add_forces(force, self.external, t, q, p, velocity, args)
 
-    def add_forces(self, force, external, t, q, p, v, args):
+    def add_forces(
+        self, force: P, external: Callable | None, t: Time, q: Q, p: P, v: Q, args
+    ) -> P:
         """As of any system, of velocities that are along the axes of bodies."""
         if external is None and not any(self.parts[1:]):
             return force

@@ -125,13 +125,17 @@ class MechanicalSystem(AbstractSystem):
     def force(self, t: Time, q: Q, p: P, args: PyTree = None) -> P:
         return self.velocity_and_force(t, q, p, args)[1]
 
-    def velocity_and_force(self, t, q, p, args=None):
+    def velocity_and_force(
+        self, t: Time, q: Q, p: P, args: PyTree = None
+    ) -> tuple[Q, P]:
         velocity = self.velocity(t, q, p, args)
         force = self.potential.force(t, q, args)
         state = t, q, p, velocity, args
         return velocity, self.add_forces(force, self.external, *state)
 
-    def from_velocity(self, t, y, args=None):
+    def from_velocity(
+        self, t: Time, y: tuple[Q, Q], args: PyTree = None
+    ) -> tuple[Q, P]:
         """The state `(q, p)` of positions and velocities `(q, v)`."""
         if isinstance(self.kinetic, QuadraticKinetic | RelativisticKinetic):
             return y[0], self.kinetic.momentum(y[1])
