@@ -78,6 +78,21 @@ def test_members_of_a_batch_keep_what_each_needs(adjoint):
     assert_close(jax.vmap(slope)(gammas, ends), alone, 1e-9)
 
 
+def with_gaps(system, solver, t1, dt0, q0, **options) -> Any:
+    """A solve from rest by constant steps, or by steps that vary if none is given."""
+    density = lambda t, y, args: 1 / (1 + y[0] @ y[0])
+    control = dps.StepDensityController(0.2, density)
+    return dfx.diffeqsolve(
+        *(system, solver, 0.0, t1, dt0, (q0, 0 * q0)),
+        stepsize_controller=dfx.ConstantStepSize() if dt0 else control,
+        **options,
+    )
+
+
+def squares(rows):
+    return jnp.sum(jnp.where(jnp.isfinite(rows), rows, 0) ** 2)
+
+
 @pytest.mark.parametrize("adjoint", [REVERSIBLE, FIXED_STEP])
 @pytest.mark.parametrize(
     "varies, steps, max_steps", [(False, 0, 5), (False, 3, 40), (True, 0, 5)]
@@ -85,19 +100,11 @@ def test_members_of_a_batch_keep_what_each_needs(adjoint):
 def test_gaps_after_the_end(adjoint, varies, steps, max_steps):
     """Of measured times: their rows come after those that are not reached."""
 
-    control = dps.StepDensityController(0.2, lambda t, y, args: 1 / (1 + y[0] @ y[0]))
-
     def value(q0, ts):
-        sol: Any = dfx.diffeqsolve(
-            *(pendulum(5.0), dps.TunedRKN6(), 0.0, 5.0, None if varies else 0.3),
-            (q0, 0 * q0),
-            stepsize_controller=control if varies else dfx.ConstantStepSize(),
-            saveat=dfx.SaveAt(ts=ts, steps=steps),
-            adjoint=adjoint,
-            max_steps=max_steps,
-            throw=False,
-        )
-        return jnp.sum(jnp.where(jnp.isfinite(sol.ys[0]), sol.ys[0], 0) ** 2)
+        saveat = dfx.SaveAt(ts=ts, steps=steps)
+        options: Any = {"max_steps": max_steps, "adjoint": adjoint, "throw": False}
+        at = pendulum(5.0), dps.TunedRKN6(), 5.0, None if varies else 0.3, q0
+        return squares(with_gaps(*at, saveat=saveat, **options).ys[0])
 
     slope, q0, ts = jax.grad(value), jnp.ones(1), jnp.array([0.4, 1.0, 3.0])
     with_gap = slope(q0, jnp.append(ts, jnp.nan))
@@ -107,19 +114,13 @@ def test_gaps_after_the_end(adjoint, varies, steps, max_steps):
 @pytest.mark.parametrize("adjoint", [REVERSIBLE, FIXED_STEP])
 @pytest.mark.parametrize("varies", [False, True])
 def test_gaps_in_what_is_a_function_of_time(adjoint, varies):
-    control = dps.StepDensityController(0.2, lambda t, y, args: 1 / (1 + y[0] @ y[0]))
     energy = lambda t, y, args: jnp.sin(t) * (jnp.sum(y[0] ** 2) + jnp.sum(y[1]))
 
     def value(q0, ts):
-        sol: Any = dfx.diffeqsolve(
-            *(pendulum(0.1), LEAPFROG, 0.0, 2.0, None if varies else 0.1),
-            (q0, 0 * q0),
-            stepsize_controller=control if varies else dfx.ConstantStepSize(),
-            saveat=dfx.SaveAt(ts=ts, fn=energy),
-            adjoint=adjoint,
-            max_steps=60,
-        )
-        return jnp.sum(jnp.where(jnp.isfinite(sol.ys), sol.ys, 0) ** 2)
+        saveat = dfx.SaveAt(ts=ts, fn=energy)
+        at = pendulum(0.1), LEAPFROG, 2.0, None if varies else 0.1, q0
+        sol = with_gaps(*at, saveat=saveat, max_steps=60, adjoint=adjoint)
+        return squares(sol.ys)
 
     slope, q0, ts = jax.grad(value), jnp.ones(1), jnp.array([0.4, jnp.nan, 1.0, 1.7])
     assert_close(slope(q0, ts), slope(q0, ts[jnp.array([0, 2, 3])]), 1e-12)
