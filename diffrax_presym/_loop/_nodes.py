@@ -52,20 +52,23 @@ def derivatives(
         dy = system.slope(system.time(t), y, force)
         return tree.scale(jnp.asarray(system.direction), dy)
 
-    first, known = slope(t, y, force), y
-    along = jnp.ones_like(t), first
+    known, rate = [y, slope(t, y, force)], slope
     if moment is not None:
-        t, y = t + cast_to(moment, t), tree.add_scaled(y, moment, first)
-    later, rate = [], slope
+        t, y = t + cast_to(moment, t), tree.add_scaled(y, moment, known[1])
     for _ in range(DERIVATIVES - 1):
-        later.append(jax.jvp(rate, (t, y), along)[1])
-        rate = _rate_of(rate, slope)
-    return jtu.tree_map(lambda *x: jnp.stack(x), known, first, *later)
+        rate = _rate_of(rate)
+        known.append(rate(t, y, *known[1:]))
+    return jtu.tree_map(lambda *x: jnp.stack(x), *known)
 
 
-def _rate_of(fn: Callable, slope: Callable) -> Callable:
-    """The derivative of `fn(t, y)` along the motion."""
-    return lambda t, y: jax.jvp(fn, (t, y), (jnp.ones_like(t), slope(t, y)))[1]
+def _rate_of(fn: Callable) -> Callable:
+    """The derivative of `fn(t, y, y', ...)`, a function of one more of these."""
+
+    def rate(t: Array, *known: State) -> State:
+        now, along = (t, *known[:-1]), (jnp.ones_like(t), *known[1:])
+        return jax.jvp(fn, now, along)[1]
+
+    return rate
 
 
 def node(
