@@ -134,6 +134,22 @@ def test_momenta_first_takes_half_of_the_iterations(n):
     assert is_successful(sol)
 
 
+@pytest.mark.parametrize("tolerance", [1e-10, 1e-6])
+def test_a_gradient_by_reversal_allows_the_error_of_the_tolerance(tolerance):
+    system, y0 = links(2)
+
+    def end(y0, tolerance, adjoint):
+        solver = dps.Suzuki4(dps.PresymplecticGauss(2, tolerance=tolerance))
+        options = {"adjoint": adjoint, "max_steps": 200}
+        sol = dfx.diffeqsolve(system, solver, 0.0, 10.0, 0.2, y0, **options)
+        return sol.ys[0][-1, 0]
+
+    exact = jax.grad(end)(y0, 0.0, dps.FixedStepAdjoint("checkpoints"))
+    found = jax.grad(end)(y0, tolerance, dps.FixedStepAdjoint())
+    for x, y in zip(found, exact, strict=True):
+        np.testing.assert_allclose(x, y, atol=100 * tolerance)
+
+
 def test_a_guess_that_diverges_is_dropped():
     system, y0 = links(6)
     solver = dps.PresymplecticGauss(8)

@@ -170,7 +170,7 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
                 arrays = map(jnp.asarray, jtu.tree_leaves(start))
                 room = _MOST_BYTES // sum(max(x.nbytes, 1) for x in arrays)
                 number = min(max(room, _FEWEST_KEPT), _MOST_KEPT)
-            return Reversal(number, self.tol, raises)
+            return Reversal(number, self.tol, scheme.inverse_error, raises)
         return Checkpoints(max_steps, number)
 
 
@@ -184,7 +184,8 @@ FixedStepAdjoint.__init__.__doc__ = """**Arguments:**
     `max_steps`, with which the memory is least.
 - `tol`: the largest error of a state recomputed by reversal, relative to the size of
     the state. Defaults to the precision of the state to the power 2/3: 4e-11 in
-    `float64`, 2e-5 in `float32`.
+    `float64`, 2e-5 in `float32`; or, if larger, to that power of the `tolerance` of
+    `PresymplecticGauss`.
 - `throw`: whether a gradient by reversal that is lost to rounding is an error (`True`),
     also of one member of a batch, or NaN (`False`). Defaults to `None`: an error unless
     it is of a batch or the solve has `throw=False`.

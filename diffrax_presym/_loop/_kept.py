@@ -33,12 +33,14 @@ class Reversal(eqx.Module):
 
     most: int = eqx.field(static=True)
     tol: float | None
+    inverse_error: float = eqx.field(static=True)  # of the scheme
     # `None`: an error, but NaN for the members of a batch.
     throw: bool | None = eqx.field(static=True)
 
     def limit(self, y: PyTree) -> tuple[float, float]:
-        """The largest allowed error of a recomputed state, and that of rounding."""
+        """The largest allowed error of a recomputed state, and that of a step back."""
         eps = float(max(jnp.finfo(x.dtype).eps for x in jtu.tree_leaves(y)))
+        eps = max(eps, self.inverse_error)
         return eps ** (2 / 3) if self.tol is None else self.tol, eps
 
     def places(self, problem: Problem) -> Array:

@@ -50,6 +50,8 @@ class Scheme(NamedTuple):
     end_force: Callable[[PyTree], PyTree | None] = lambda carry: None
     # Whether a step can be inverted from its end.
     is_invertible: bool = True
+    # To which relative error, where it is not rounding.
+    inverse_error: float = 0.0
     # Whether a step uses those before it, so that it must start again at a kink.
     has_history: bool = False
     # Whether a step solves equations by iteration.

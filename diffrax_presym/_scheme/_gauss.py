@@ -222,9 +222,8 @@ class PresymplecticGauss(AbstractPresymplecticSolver):
         - `tolerance`: the relative change of the stages below which the fixed-point
             iteration may end, a Python float. Symmetry and structure are then kept to
             this tolerance only, and so are steps that `FixedStepAdjoint` takes
-            backwards, whose `tol` must be larger. A hundredth of the error that is
-            wanted saves up to two thirds of the iterations. Defaults to 0, for
-            iteration to rounding.
+            backwards. A hundredth of the error that is wanted saves up to two thirds
+            of the iterations. Defaults to 0, for iteration to rounding.
 
         **Raises:**
 
@@ -269,7 +268,7 @@ class PresymplecticGauss(AbstractPresymplecticSolver):
             zero = jnp.zeros((), jnp.result_type(t))
             return _Carry(tree.zeros(y), jtu.tree_map(many, y), zero)
 
-        return Scheme(move, start=start, is_implicit=True)
+        return Scheme(move, start=start, is_implicit=True, inverse_error=self.tolerance)
 
 
 def _check_number(x, most: int | None, name: str) -> None:
