@@ -292,7 +292,9 @@ def free_rotation(p: Vectors, rates: Vectors, s: Array) -> tuple[Quaternions, Ve
     the start, and the angular momenta along the axes at the end. `rates` are the
     inverses of the moments of inertia. Not a number if a momentum turns by more than
     half of a circle, relative to the body."""
-    unit = lax.stop_gradient(jnp.max(jnp.abs(p), axis=-1, keepdims=True))
-    unit = jnp.where(unit > 0, unit, 1)
+    # By a power of two: rounding by any other unit was not the same up and down, and
+    # the momentum decayed.
+    exponent = jnp.frexp(jnp.max(jnp.abs(p), axis=-1, keepdims=True))[1]
+    unit = lax.stop_gradient(jnp.ldexp(jnp.ones((), p.dtype), exponent))
     turn, end = _rotation(*once((p / unit, rates * unit)), s)
     return turn, end * unit
