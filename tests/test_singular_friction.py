@@ -132,3 +132,93 @@ def test_gradients_by_variable_steps_from_a_singular_start(friction):
     q, d = jnp.ones(1), 1e-5
     wanted = (loss(q + d) - loss(q - d)) / (2 * d)
     assert jax.grad(loss)(q)[0] == pytest.approx(float(wanted), rel=1e-7)
+
+
+def test_the_effect_does_not_depend_on_the_order_of_laws():
+    one = jnp.ones(())
+    terms = [
+        (Logarithm(None), 3 * one),
+        (Logarithm(one), one),
+        (FunctionOfTime(jnp.sin), -one / 2),
+    ]
+    for t, h in (0.0, 0.3), (0.2, 0.3):
+        effects = [
+            EntryFriction(order).prepare(t, h, 8)
+            for order in itertools.permutations(terms)
+        ]
+        for effect in effects[1:]:
+            np.testing.assert_allclose(effect, effects[0], rtol=1e-12)
+
+
+def pendulum(law, t0, t1, n, ts, y0=(1.0, 0.0), adjoint: Any = OWN):
+    system = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), lambda t, q, args: -jnp.sum(jnp.cos(q)), law
+    )
+    y0 = tuple(jnp.asarray([y]) for y in y0)
+    solve = (system, dps.BlanesMoanRKN4(), t0, t1, (t1 - t0) / n, y0)
+    options = {"throw": False, "max_steps": 200}
+    saveat = dfx.SaveAt(ts=jnp.asarray(ts))
+    return dfx.diffeqsolve(*solve, saveat=saveat, adjoint=adjoint, **options)
+
+
+def by_scipy(delta, ts):
+    def slope(t, y):
+        return [y[1], -np.sin(y[0]) - 0.4 * delta * t ** (delta - 1) * y[1]]
+
+    begin = 1e-9
+    start = [1.0, -np.sin(1.0) * begin]
+    return scipy.integrate.solve_ivp(
+        *(slope, (begin, ts[-1]), start, "DOP853", ts), rtol=1e-12, atol=1e-13
+    ).y
+
+
+@pytest.mark.parametrize(
+    "delta, error", [(0.5, 2e-3), (1.5, 1e-5), (2.0, 1e-6), (2.5, 1e-6)]
+)
+def test_values_in_the_first_steps_of_a_power_of_time(delta, error):
+    """Whose rate has no two derivatives at zero, or seems to have none."""
+    ts = [0.04, 0.17, 0.31, 2.0]
+    value = jax.jit(lambda d: pendulum(dps.PowerDamping(0.4, d), 0.0, 2.0, 20, ts).ys)
+    np.testing.assert_allclose(
+        jnp.stack(value(delta))[..., 0], by_scipy(delta, ts), atol=error
+    )
+    if delta != 2:  # there the interpolation differs
+        total = lambda d: sum(jnp.sum(y) for y in value(d))
+        wanted = (total(delta + 1e-5) - total(delta - 1e-5)) / 2e-5
+        assert jax.grad(total)(delta) == pytest.approx(float(wanted), rel=1e-6)
+
+
+def test_gradients_by_the_exponent_of_values_between_steps():
+    law = lambda d: dps.PowerDamping(0.3, d)
+    ts = [1.33, 1.5, 1.77]
+    total = jax.jit(lambda d: jnp.sum(pendulum(law(d), 1.0, 2.0, 10, ts).ys[0]))
+    wanted = (total(0.6 + 1e-5) - total(0.6 - 1e-5)) / 2e-5
+    assert jax.grad(total)(0.6) == pytest.approx(float(wanted), rel=1e-7)
+
+
+@pytest.mark.parametrize("adjoint", [OWN, dfx.RecursiveCheckpointAdjoint()])
+@pytest.mark.parametrize("delta", [1.5, 2.0])
+def test_backwards_to_the_start_of_a_power_of_time(delta, adjoint):
+    at_end = by_scipy(delta, [2.0])[:, 0]
+    solve = lambda d: pendulum(
+        dps.PowerDamping(0.4, d), 2.0, 0.0, 20, [0.0], at_end, adjoint
+    )
+    sol = solve(delta)
+    assert sol.result == dfx.RESULTS.successful
+    np.testing.assert_allclose(sol.ys[0][0, 0], 1.0, atol=1e-5)
+    end = jax.jit(lambda d: solve(d).ys[1][0, 0])
+    wanted = (end(delta + 1e-5) - end(delta - 1e-5)) / 2e-5
+    assert jax.grad(end)(delta) == pytest.approx(float(wanted), rel=1e-6)
+
+
+GROWING = [dps.LogDamping(-0.5)], [dps.PowerDamping(0.3, -1.0)]
+GROWING += ([dps.LogDamping(1.0), dps.LogDamping(-2.0)],)
+
+
+@pytest.mark.parametrize("laws", GROWING)
+def test_infinite_growth_at_the_start_fails(laws):
+    assert pendulum(laws, 0.0, 1.0, 20, [1.0]).result != dfx.RESULTS.successful
+    less = [*laws, dps.LogDamping(3.0)]
+    known = not isinstance(laws[0], dps.PowerDamping)
+    sol = pendulum(less, 0.0, 1.0, 20, [1.0])
+    assert (sol.result == dfx.RESULTS.successful) == known

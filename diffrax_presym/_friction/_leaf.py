@@ -4,6 +4,7 @@ import functools
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Inexact
@@ -38,9 +39,21 @@ class EntryFriction(eqx.Module):
     def prepare(self, t: Time, h: Time, order: int) -> Effect:
         if len(self.terms) == 1:
             ((law, rate),) = self.terms
-            return law.effect(rate, t, h, order)
-        effect = by_powers(self.terms, t, h, order)
-        return by_quadrature(self.terms, t, h, order) if effect is None else effect
+            effect = law.effect(rate, t, h, order)
+        else:
+            effect = by_powers(self.terms, t, h, order)
+            effect = effect or by_quadrature(self.terms, t, h, order)
+        singular = [(*term, term[0].is_singular(t)) for term in self.terms]
+        strengths = [
+            jnp.where(here, law.strength * rate, 0)
+            for law, rate, here in singular
+            if here is not None
+        ]
+        if not strengths:
+            return effect
+        # No motion starts from infinite growth.
+        grows = functools.reduce(jnp.add, strengths) < 0
+        return effect._replace(change=jnp.where(grows, jnp.nan, effect.change))
 
     def fix(self, effects: Sequence[Effect]) -> Sequence[Effect]:
         return effects
@@ -94,6 +107,15 @@ class EntryFriction(eqx.Module):
         ratio = jnp.where(falls, second / jnp.where(falls, first, 1), 1)
         both = jnp.where(falls, 2 * second * ratio**2, first + second)
         return jnp.max(both, initial=0)
+
+    def is_smooth(self, t: Time) -> Bool[Array, ""]:
+        def each(law: AbstractLogScale) -> Bool[Array, ""]:
+            slope = lambda t: jax.jvp(law.rate, (t,), (jnp.ones_like(t),))[1]
+            return jnp.all(jnp.isfinite(jax.jvp(slope, (t,), (jnp.ones_like(t),))[1]))
+
+        t = as_time(t)
+        laws = [law for law, _ in self.terms if not law.is_autonomous]
+        return functools.reduce(jnp.logical_and, map(each, laws), jnp.asarray(True))
 
     def scaled(self, factor: Scalar) -> "EntryFriction":
         return EntryFriction(tuple((law, _times(factor, x)) for law, x in self.terms))
@@ -165,6 +187,9 @@ class MatrixFriction(eqx.Module):
 
     def strength(self, t: Time, h: Time) -> Scalar:
         return self.growth(t, h)
+
+    def is_smooth(self, t: Time) -> Bool[Array, ""]:
+        return jnp.asarray(True)
 
     def scaled(self, factor: Scalar) -> "MatrixFriction":
         return MatrixFriction(_times(factor, self.matrix))

@@ -133,6 +133,10 @@ class LinearFriction(eqx.Module):
         first = jnp.minimum(t, t + h)
         return functools.reduce(jnp.maximum, self._each("strength", first, jnp.abs(h)))
 
+    def is_smooth(self, t: Time) -> Bool[Array, ""]:
+        """Whether its rates have two derivatives at `t`."""
+        return functools.reduce(jnp.logical_and, self._each("is_smooth", t))
+
     def scaled(self, factor: Scalar) -> "LinearFriction":
         """A part of it."""
         scale = lambda leaf: leaf.scaled(factor)

@@ -179,10 +179,10 @@ class Power(AbstractLogScale):
     is_autonomous: ClassVar[bool] = False
 
     def _parameters(self, t: Time):
-        """Whether time is zero; the time there, or 0, which keeps its derivative; the
+        """Whether time is zero; the time there, which keeps its derivative, and the
         time elsewhere, or 1; and the exponent."""
         zero, t = as_time(t) == 0, as_time(t)
-        here, since = jnp.where(zero, t, 0), jnp.where(zero, 1, t)
+        here, since = jnp.where(zero, t, 1), jnp.where(zero, 1, t)
         return zero, here, since, cast_to(self.delta, t)
 
     def __call__(self, t: Time) -> Scalar:
@@ -192,16 +192,24 @@ class Power(AbstractLogScale):
     def increment(self, t: Time, h: Time) -> Scalar:
         zero, here, since, delta = self._parameters(t)
         h = as_time(h)
-        grown = since**delta * expm1(delta * jnp.log1p(h / since))
+        # Back to zero, where time may be negative by rounding.
+        back = h / since < -0.5
+        end = jnp.maximum(jnp.where(back, since + h, 1), 0)
+        change = jnp.log1p(jnp.where(back, 0, h) / since)
+        ahead = since**delta * expm1(delta * change)
+        grown = jnp.where(back, end**delta - since**delta, ahead)
         before = jnp.where(delta == 0, 1, here ** jnp.maximum(delta, 1))
         # A root has no derivative at zero.
         some = zero & ((here + h != 0) | (delta >= 1))
         first = jnp.where(some, here + h, 1) ** delta - before
-        return jnp.where(some, first, jnp.where(zero, 0, grown))
+        from_zero = jnp.where(delta < 0, jnp.nan, jnp.where(some, first, 0))
+        return jnp.where(zero, from_zero, grown)
 
     def rate(self, t: Time) -> Scalar:
         zero, here, since, delta = self._parameters(t)
-        smooth = jnp.where(delta == 1, 1, delta * here ** jnp.maximum(delta - 1, 1))
+        # To JAX a power of one has no second derivative at zero.
+        power = delta * here ** jnp.where((delta <= 1) | (delta == 2), 2, delta - 1)
+        smooth = jnp.where(delta == 1, 1, jnp.where(delta == 2, 2 * here, power))
         first = jnp.where((delta < 1) & (delta != 0), jnp.inf, smooth)
         return jnp.where(zero, first, delta * since ** (delta - 1))
 

@@ -4,6 +4,7 @@ After it no polynomial follows the decay of a momentum, but one follows that by 
 other parts, and the integrals of powers of time are known.
 """
 
+import functools
 import itertools
 
 import jax.numpy as jnp
@@ -27,7 +28,8 @@ def by_powers(terms: Terms, t: Time, h: Time, order: int) -> Effect | None:
     logarithms = [x for x in terms if isinstance(x[0], Logarithm)]
     if not logarithms:
         return None
-    own, others = logarithms[:1], [x for x in terms if x is not logarithms[0]]
+    own, others = _nearest(logarithms, t, h)
+    others += [x for x in terms if not isinstance(x[0], Logarithm)]
     nodes, weights = np.polynomial.legendre.leggauss(order)
     values = np.polynomial.legendre.legvander(nodes, order - 1)
     coefficients = values.T * weights * np.arange(0.5, order)[:, None]
@@ -56,6 +58,24 @@ def by_powers(terms: Terms, t: Time, h: Time, order: int) -> Effect | None:
 
     integrals = map(integral, smooth, powers, moments)
     return Effect(expm1(-increment(terms, t, h)), *integrals)
+
+
+def _nearest(logarithms: Terms, t: Time, h: Array) -> tuple[list, list]:
+    """The logarithm whose singularity is nearest to a span, and what is left."""
+    if len(logarithms) == 1:
+        return list(logarithms), []
+    t = as_time(t)
+    laws, rates = zip(*logarithms, strict=True)
+    shift = lambda law: 0.0 if law.shift is None else law.shift
+    shifts = jnp.stack([cast_to(shift(law), t) for law in laws])
+    away = jnp.minimum(jnp.abs(t + shifts), jnp.abs(t + h + shifts))
+    nearest = jnp.argmin(away)
+    parts = [jnp.where(nearest == k, rate, 0) for k, rate in enumerate(rates)]
+    own = Logarithm(shifts[nearest]), functools.reduce(jnp.add, parts)
+    others = [
+        (law, rate - part) for law, rate, part in zip(laws, rates, parts, strict=True)
+    ]
+    return [own], others
 
 
 def _moments(

@@ -37,7 +37,7 @@ def follows(system: System, t0: Array, h: Array) -> Any:
     if friction is None:
         return True
     most = jnp.maximum(friction.growth(start, h), friction.angle(h))
-    return most <= MOST_FRICTION
+    return (most <= MOST_FRICTION) & friction.is_smooth(start)
 
 
 class AbstractSteps(eqx.Module):
