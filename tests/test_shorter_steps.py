@@ -205,3 +205,58 @@ def test_backwards_to_strong_friction_takes_shorter_steps():
     assert int(back.stats["interpolated"]) == 0
     for x, y in zip(there.ys, back.ys, strict=True):
         np.testing.assert_allclose(x[::-1], y, 0, 1e-5)
+
+
+def test_gradients_beside_a_member_of_few_steps():
+    """Which takes shorter steps where the other interpolates."""
+
+    def total(rate, dt0):
+        well = lambda t, q, args: -jnp.sum(jnp.cos(q))
+        law = lambda t: rate * (t + 0.5 * jnp.sin(t))
+        sol: Any = dfx.diffeqsolve(
+            dps.MechanicalSystem(dps.QuadraticKinetic(), well, law),
+            *(dps.BlanesMoanRKN4(), 0.0, 0.6, dt0, (jnp.ones(1), jnp.ones(1))),
+            saveat=dfx.SaveAt(ts=jnp.array([0.25, 0.5])),
+            adjoint=dps.FixedStepAdjoint(),
+        )
+        return jnp.sum(sol.ys[0])
+
+    slope, steps = jax.grad(total), jnp.array([0.1, 0.3])
+    got = jax.jit(jax.vmap(slope, (None, 0)))(0.2, steps)
+    np.testing.assert_allclose(got, [slope(0.2, h) for h in steps], rtol=1e-10)
+
+
+def test_second_derivatives_of_a_batch_by_its_friction():
+    """Where the rows that are interpolated differ among the members."""
+
+    def total(k):
+        well = lambda t, q, args: -jnp.sum(jnp.cos(q))
+        law = dps.ConstantDamping(0.1 * k)
+        sol: Any = dfx.diffeqsolve(
+            dps.MechanicalSystem(dps.QuadraticKinetic(), well, law),
+            *(dps.BlanesMoanRKN4(), 0.0, 1.0, 0.2, (jnp.ones(2), jnp.zeros(2))),
+            saveat=dfx.SaveAt(ts=jnp.array([0.13, 0.5, 0.77])),
+            adjoint=dps.FixedStepAdjoint(),
+        )
+        return jnp.sum(sol.ys[0] ** 2)
+
+    ks, h, slope = jnp.array([1.0, 40.0]), 1e-5, jax.jit(jax.grad(total))
+    got = jax.jit(jax.vmap(jax.hessian(total)))(ks)
+    wanted = [(slope(k + h) - slope(k - h)) / (2 * h) for k in ks]
+    np.testing.assert_allclose(got, wanted, rtol=1e-5)
+
+
+@pytest.mark.parametrize("adjoint", [dps.FixedStepAdjoint(), dfx.DirectAdjoint()])
+def test_values_just_before_a_solve_is_cut_off(adjoint):
+    """Less than three steps after one of the given times."""
+    well = lambda t, q, args: -jnp.sum(jnp.cos(q))
+    sol: Any = dfx.diffeqsolve(
+        dps.MechanicalSystem(dps.QuadraticKinetic(), well),
+        *(dps.BlanesMoanRKN4(), 0.0, 2.0, 0.1, (jnp.ones(1), jnp.zeros(1))),
+        saveat=dfx.SaveAt(ts=jnp.array([0.55, 1.02, 1.12, 1.3])),
+        stepsize_controller=dps.StepsBetween(jnp.ones(1)),
+        adjoint=adjoint,
+        **{"throw": False, "max_steps": 12},
+    )
+    assert sol.result == dfx.RESULTS.max_steps_reached
+    assert np.isfinite(sol.ys[0][:, 0]).tolist() == [True, True, True, False]

@@ -114,7 +114,7 @@ def _rate(system: System, t: Array, y: State, h: Array) -> Float[Array, ""]:
 def first_node(system: System, steps: Steps, last: Array, y: State) -> Int[Array, ""]:
     """The step from whose start on values between steps are interpolated; before it
     they are shorter steps."""
-    yes = jnp.minimum(steps.fewest, last) >= NODES - 1
+    yes = steps.fewest(last) >= NODES - 1
     yes &= steps.ratio <= _MOST_RATIO
     first = jnp.zeros((), int)
     if system.friction is not None:

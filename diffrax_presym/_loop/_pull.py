@@ -65,7 +65,8 @@ def _pull_row(
     row = row_of(rows.each, j)
     # Of the others nothing may fail of which a gradient takes zero times.
     here = problem.steps.begin(at.n, at.point)
-    row = row._replace(time=jnp.where(taken, row.time, here))
+    time, inside = jnp.where(taken, row.time, here), row.inside & taken
+    row = row._replace(time=time, inside=inside)
 
     def pull(shorter: bool):
         def output(functions: Functions, start: Point):

@@ -249,4 +249,15 @@ def _put_here(axis: int) -> Callable[..., Array]:
 
         return jax.vmap(each_at_own)(xs, x, i, here), True
 
-    return one
+    # It is linear. JAX takes its derivative as another batch, in which `i` and `here`,
+    # which have none, would seem to be the same for all members.
+    whole = jax.custom_jvp(one)
+
+    @whole.defjvp
+    def _(primals, tangents):
+        change = tangents[0]
+        if jnp.issubdtype(primals[0].dtype, jnp.inexact):
+            change = whole(*tangents[:2], *primals[2:])
+        return whole(*primals), change
+
+    return whole
