@@ -125,8 +125,9 @@ class LogDamping(AbstractDamping):
 
     Write the infinite part of a rate as this law also if there is more of it, in a list
     with the rest: its power of time is then exact, where a function alone loses most
-    digits in the first steps. The rate `2 a coth(a t)` is `[LogDamping(2.0), eta]` with
-    `eta = lambda t: 2 * jnp.log(jnp.sinh(a * t) / t)`.
+    digits in the first steps. The rest must be finite at the start. The rate
+    `2 a coth(a t)` is `[LogDamping(2.0), lambda t: 2 * jnp.log(jnp.sinh(x(t)) / x(t))]`
+    with `x = lambda t: jnp.maximum(a * t, 1e-9)`.
     """
 
     gamma: Numbers

@@ -31,7 +31,8 @@ class Drag(AbstractFriction):
     composition, of the order of the scheme, of the force and of drag alone, which keeps
     the direction and has a closed form. The force is evaluated once per kick. `Strang`,
     `BlanesMoan4` and `BlanesMoan6` keep their order; Runge--Kutta--Nyström splittings
-    would not, and refuse it. No structure is kept but the symmetry. In a wind or a
+    would not, and refuse it. No structure is kept but the symmetry. Of a few bodies the
+    same drag as `MechanicalSystem(..., force=f)` is faster. In a wind or a
     current, give the velocity `w` of the `medium`: the drag is then
     `-c |v - w| (v - w)`.
 

@@ -54,8 +54,8 @@ class ChosenStep(NamedTuple):
             "jumps, end the solve and begin another."
         )
         limit = (
-            " Steps that are not much longer are unstable: for other parameters, as in "
-            "a fit, choose the step with those of the fastest motion."
+            " Steps that are not much longer are unstable, or miss an event: for other "
+            "parameters, as in a fit, choose the step with those of the fastest motion."
         )
         # More than by any order of convergence.
         near = [x for x in self.trials if 0.7 * self.steps <= x.steps < self.steps]
