@@ -290,7 +290,8 @@ def _exceeds(law: Law | None, max_steps: int, needed: float = math.inf) -> str:
         what, found = "found no finite solution", f"with up to {tried} steps"
         advice = (
             "Check that the solution exists up to `t1`, that force and friction are "
-            "finite along it, and that the solve allows as many steps (`max_steps=None`)."
+            "finite along it, and that the solve allows as many steps "
+            "(`max_steps=None`)."
         )
         if law.finest.missed:
             advice = (
