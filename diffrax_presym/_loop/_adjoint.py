@@ -41,7 +41,8 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     schemes up to order two, of `TunedLinear8`, of systems with constraints or on
     manifolds, in spans of fewer than three steps, where neighbouring steps of
     `diffrax.StepTo` differ by more than a factor of two, and where friction over a step
-    is more than 0.5, or its matrix turns momenta by more than a radian. The statistics
+    is more than 0.5, its rate has no second derivative by time, or its matrix turns
+    momenta by more than a radian. The statistics
     say how many values are interpolated, `sol.stats["interpolated"]`. How strong
     friction by place or by speed, of a `LagrangianSystem` or in a `force` is, is
     estimated at the start of the solve alone (a relaxation of 1 over a step): if it
