@@ -1,11 +1,11 @@
 """How long the first solve takes, most of which is compilation, over that of Tsit5.
 
-Of scalar friction and matrix friction with `TunedRKN6`, and of a mass matrix that
-depends on positions with `PresymplecticGauss(4)`, and of two rods with ball joints and
-drag, free bodies with constraints, with `Strang`: seconds from the call of `jax.jit` of
-a solve to its result, that saves the end or at 501 times, and of the gradient of a sum
-of squares at the end. The solvers of Diffrax solve the same system with constant
-steps. Each number is measured in a fresh process, without a cache of compiled programs;
+Of scalar friction, matrix friction and a list of two laws that depend on time with
+`TunedRKN6`, of a mass matrix that depends on positions with `PresymplecticGauss(4)`,
+and of two rods with ball joints and drag, free bodies with constraints, with `Strang`:
+seconds from the call of `jax.jit` of a solve to its result, that saves the end or at
+501 times, and of the gradient of a sum of squares at the end. The solvers of Diffrax
+solve the same system with constant steps. Each number is measured in a fresh process, without a cache of compiled programs;
 imports do not count. Medians of all processes, and of the ratios of neighbours.
 
 `--readme` measures the README's first result, the choice of the step and the solve, and
@@ -33,6 +33,7 @@ SPAN = 10.0
 OURS = {
     "scalar friction": dps.TunedRKN6(),
     "matrix friction": dps.TunedRKN6(),
+    "two laws of time": dps.TunedRKN6(),
     "M(q), Gauss": dps.PresymplecticGauss(4),
     "joined bodies": dps.Strang(),
 }
@@ -50,6 +51,8 @@ def system_of(kind):
         return dps.LagrangianSystem(mass, height, dps.ViscousDamping(0.1))
     potential = lambda t, q, args: jnp.sum(jnp.diff(q) ** 2) - jnp.sum(jnp.cos(q))
     law = dps.ConstantDamping(0.1)
+    if kind == "two laws of time":
+        law = [dps.LogDamping(3.0, 1.0), lambda t: 0.1 * jnp.sin(t)]
     if kind == "matrix friction":
         law = dps.ViscousDamping(0.1 * (2 * jnp.eye(N) - jnp.eye(N, k=1)))
     return dps.MechanicalSystem(dps.QuadraticKinetic(), potential, law)

@@ -150,7 +150,7 @@ def test_the_effect_does_not_depend_on_the_order_of_laws():
             np.testing.assert_allclose(effect, effects[0], rtol=1e-12)
 
 
-def pendulum(law, t0, t1, n, ts, y0=(1.0, 0.0), adjoint: Any = OWN):
+def pendulum(law, t0, t1, n, ts, y0=(1.0, 0.0), adjoint: Any = OWN) -> Any:
     system = dps.MechanicalSystem(
         dps.QuadraticKinetic(), lambda t, q, args: -jnp.sum(jnp.cos(q)), law
     )
