@@ -5,8 +5,9 @@ Of scalar friction, matrix friction and a list of two laws that depend on time w
 and of two rods with ball joints and drag, free bodies with constraints, with `Strang`:
 seconds from the call of `jax.jit` of a solve to its result, that saves the end or at
 501 times, and of the gradient of a sum of squares at the end. The solvers of Diffrax
-solve the same system with constant steps. Each number is measured in a fresh process, without a cache of compiled programs;
-imports do not count. Medians of all processes, and of the ratios of neighbours.
+solve the same system with constant steps. Each number is measured in a fresh process,
+without a cache of compiled programs; imports do not count. Medians of all processes,
+and of the ratios of neighbours.
 
 `--readme` measures the README's first result, the choice of the step and the solve, and
 the first gradient, over the same solve and gradient by an adaptive `Tsit5`.

@@ -60,7 +60,7 @@ def by_powers(terms: Terms, t: Time, h: Time, order: int) -> Effect | None:
     return Effect(expm1(-increment(terms, t, h)), *integrals)
 
 
-def _nearest(logarithms: Terms, t: Time, h: Array) -> tuple[list, list]:
+def _nearest(logarithms: Terms, t: Time, h: Time) -> tuple[list, list]:
     """The logarithm whose singularity is nearest to a span, and what is left."""
     if len(logarithms) == 1:
         return list(logarithms), []
