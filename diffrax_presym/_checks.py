@@ -82,6 +82,11 @@ def check_root_finder(root_finder) -> None:
             "`root_finder` must be an Optimistix root finder, for example "
             f"`optimistix.Newton(rtol=1e-10, atol=1e-10)`, but got {root_finder!r}."
         )
+    if isinstance(root_finder, optx.Bisection):
+        raise ValueError(
+            "`root_finder` solves for many numbers at once, but `optimistix.Bisection` "
+            "is for one. Write for example `optimistix.Newton(rtol=1e-10, atol=1e-10)`."
+        )
     # Diffrax's own root finders leave their tolerances to an adaptive controller.
     for name in ("rtol", "atol"):
         if not eqx.is_array_like(getattr(root_finder, name, 0.0)):

@@ -1,9 +1,7 @@
 # pyright: reportOptionalOperand=false, reportOptionalMemberAccess=false
-"""`choose_step`: the tolerance is reached, by a step not much shorter than needed; and
-`StepsBetween`, for forces with kinks.
+"""`choose_step`: the tolerance is reached, by a step not much shorter than needed.
 
-Errors are measured here against `Dopri8` with a small tolerance, which ends a step at
-each saved time, or against SciPy.
+Errors are measured against `Dopri8`, which ends a step at each saved time, or SciPy.
 """
 
 from typing import Any

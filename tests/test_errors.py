@@ -232,6 +232,10 @@ SOLVERS = {
         )
         for x in ("newton", optx.Newton, optx.BFGS(rtol=1e-3, atol=1e-3))
     },
+    "root finder for one number": (
+        call(dps.PresymplecticGauss, 2, optx.Bisection(1e-8, 1e-8)),
+        "`root_finder` solves for many numbers", "`optimistix.Bisection` is for one",
+        NEWTON),
     "root finder without tolerances": (
         call(dps.PresymplecticGauss, 2, WITHOUT_TOLERANCES), "`root_finder` needs",
         "needs a tolerance `rtol`", NEWTON),

@@ -223,3 +223,24 @@ def test_variable_steps_are_reversible_between_events():
         energies.append(float(PLANET.energy(0.0, q, p)))
         t, y = jnp.asarray(ts[-1]), (q, p * jnp.array([1.0, -1.0]))
     assert np.ptp(energies) < 1e-6
+
+
+# An event in the second of 4 and of 7 steps; in the first of both; and at the start.
+@pytest.mark.parametrize("at, t1", [(1.4, 5.2), (0.01, 5.0), (0.0, 5.0)])
+def test_a_step_for_an_event_in_the_first_steps(at, t1):
+    past = lambda t, y, args, **kwargs: t - at
+
+    @jax.jit
+    def solve(dt0):
+        y0 = jnp.ones(1), jnp.zeros(1)
+        event = dfx.Event(past if at else lambda t, y, args, **kwargs: t >= 0, FINDER)
+        return dfx.diffeqsolve(
+            *(system(), dps.PresymplecticLeapfrog(), 0.0, t1, dt0, y0), event=event
+        )
+
+    choose = lambda: dps.choose_step(solve, 0.0, t1, rtol=1e-6, atol=1e-6)
+    if at:
+        assert choose().error <= 1
+        return
+    with pytest.raises(ValueError, match="or an event ends it at once"):
+        choose()

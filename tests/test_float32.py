@@ -175,3 +175,26 @@ def test_each_leaf_is_as_accurate_as_its_precision_allows():
     mixed, exact = run(MIXED), run(double)
     for x, y in zip(jtu.tree_leaves(mixed), jtu.tree_leaves(exact), strict=True):
         assert np.max(np.abs(x.astype(jnp.float64) - y)) < 20 * jnp.finfo(x.dtype).eps
+
+
+def test_a_step_for_values_that_are_saved_in_single_precision():
+    """Which agree to all digits long before the solution is that accurate."""
+    swing = dps.MechanicalSystem(UNIT, lambda t, q, args: -jnp.sum(jnp.cos(q)))
+
+    def solve(save):
+        single = dfx.SubSaveAt(t1=True, fn=lambda t, y, args: save(y[0]))
+        return jax.jit(
+            lambda dt0: dfx.diffeqsolve(
+                *(swing, dps.TunedRKN6(), 0.0, 7.0, dt0, (jnp.ones(1), jnp.zeros(1))),
+                saveat=dfx.SaveAt(subs=single),
+            )
+        )
+
+    choose = lambda save, tol: dps.choose_step(
+        solve(save), 0.0, 7.0, rtol=tol, atol=tol
+    )
+    with pytest.raises(RuntimeError, match="tolerance in float32, to which the solve"):
+        choose(jnp.float32, 1e-8)
+    assert choose(jnp.float32, 1e-4).error <= 1
+    with pytest.raises(ValueError, match="must save values at some times"):
+        choose(lambda q: None, 1e-4)

@@ -103,6 +103,23 @@ def test_free_body_beside_elliptic_functions(periods, error):
     np.testing.assert_allclose(matrix(np.asarray(q)) @ p, p0, atol=1e-14 * (10 + steps))
 
 
+def test_third_derivatives_at_rest_on_a_circle():
+    system = dps.ManifoldSystem(dps.Sphere(), lambda t, q, args: 0.0 * q[0])
+
+    def height(v):
+        y0 = jnp.array([0.0, 1.0]), v * jnp.array([1.0, 0.0])
+        sol = diffeqsolve(
+            *(system, dps.Strang(), 0.0, 1.0, 0.25, y0), adjoint=dfx.ForwardMode()
+        )
+        return sol.ys[0][-1, 0]  # the sine of v
+
+    third = height
+    for _ in range(3):
+        third = jax.jacfwd(third)
+    for v in (0.0, 0.01, 0.3):
+        assert third(v) == pytest.approx(-np.cos(v), abs=1e-10)
+
+
 def test_smallest_eigenvectors():
     n, k = 20, 3
     frame = np.linalg.qr(rng.standard_normal((n, n)))[0]

@@ -122,7 +122,7 @@ def find_steps(
     report: Callable[[Trial], None],
 ) -> Choice:
     law = grid = doubted = None
-    numbers, expected = doubling(4), float
+    same, numbers, expected = 0, doubling(4), float
     while expected(n := next(numbers)) <= max_steps:
         finest, last = solve(n), law and law.finest
         expected = finest.expected
@@ -137,14 +137,18 @@ def find_steps(
             law = Law((), finest, finest.order, tolerances)
             continue
         if last.finite and last.steps == finest.steps:
-            if 1 < finest.steps < n:
+            same += 1
+            # Of two steps, an event may end one solve and the next in the second; of
+            # one, many in the first.
+            if (same > 1 and 1 < finest.steps < n) or n > max_steps > finest.steps:
                 raise ValueError(
-                    f"The solve does not use `dt0`: it takes {finest.steps} steps also "
-                    f"where `dt0` is that of {n}. Write `solve = lambda dt0: "
-                    "diffeqsolve(..., dt0=dt0, ...)`, with steps of constant size."
+                    "The solve does not use `dt0`, or an event ends it at once: it "
+                    f"takes {finest.steps} steps also where `dt0` is that of {n}. "
+                    "Write `solve = lambda dt0: diffeqsolve(..., dt0=dt0, ...)`, with "
+                    "steps of constant size."
                 )
             continue  # Steps between given times may be the same.
-        law = law.add(finest)
+        same, law = 0, law.add(finest)
         high = law.trial(last)
         report(high)
         converges = len(law.ladder) > 1 and (law.converges or law.agrees)
@@ -158,6 +162,8 @@ def find_steps(
             smooth = _is_smooth(law, high, grid, measure)
             rounding = max(x.error for x in law.ladder[-2:]) < 1e-3
             rounding = rounding or (law.agrees and not law.exceeds(0.75))
+            if rounding:
+                finest.check_precision(*tolerances)
             order = math.nan if rounding else law.orders[-1]
             choice = Choice(high, order, law.claimed, smooth, grid)
             if smooth or doubted:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import diffrax as dfx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
@@ -24,6 +25,7 @@ class Solution(NamedTuple):
     finite: bool
     order: int | None  # of the scheme, if that is known
     interpolates: bool = False  # between steps, at no cost
+    values: int = 0  # the number of leaves that are values
     missed: bool = False  # whether its steps were far from what their density asks for
 
     def expected(self, number: int) -> float:
@@ -65,12 +67,13 @@ class Solution(NamedTuple):
                 "for its most difficult member."
             )
         times = [np.asarray(t) for t in jax.tree.leaves(sol.ts)]
-        if not times:
-            raise ValueError(
-                "The solve must save at some times, for example by `SaveAt(t1=True)`, "
-                "to find its error."
-            )
         values = [np.asarray(y) for y in jax.tree.leaves(sol.ys)]
+        by_event = bool(sol.result == dfx.RESULTS.event_occurred)
+        if not times or not (by_event or any(y.size for y in values)):
+            raise ValueError(
+                "The solve must save values at some times, for example by "
+                "`SaveAt(t1=True)`, to find its error."
+            )
         good = (dfx.RESULTS.successful, dfx.RESULTS.event_occurred)
         finite = any(bool(sol.result == x) for x in good)
         if finite and not all(np.all(np.isfinite(t)) for t in times):
@@ -89,8 +92,23 @@ class Solution(NamedTuple):
             finite,
             None if order is None else int(order),
             bool(sol.stats.get("interpolated", False)),
+            len(values),
             bool(sol.result == STEP_DENSITY_MISSED),
         )
+
+    def check_precision(self, rtol: float, atol: float):
+        """An error if what is saved is rounded to less than the tolerance, so that
+        solves agree of which it says nothing."""
+        for y in self.leaves[: self.values]:
+            if not jnp.issubdtype(y.dtype, jnp.inexact):
+                continue
+            size, eps = np.abs(np.asarray(y, complex)), float(jnp.finfo(y.dtype).eps)
+            if np.any(eps / 4 * size > atol + rtol * size):
+                raise RuntimeError(
+                    f"`choose_step` cannot reach this tolerance in {y.dtype}, to which "
+                    "the solve rounds what it saves. Save it in a higher precision, or "
+                    "use a larger tolerance."
+                )
 
 
 def scaled_error(
