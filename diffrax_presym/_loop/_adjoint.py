@@ -42,13 +42,12 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     manifolds, in spans of fewer than three steps, where neighbouring steps of
     `diffrax.StepTo` differ by more than a factor of two, and where friction over a step
     is more than 0.5, its rate has no second derivative by time, or its matrix turns
-    momenta by more than a radian. The statistics
-    say how many values are interpolated, `sol.stats["interpolated"]`. How strong
-    friction by place or by speed, of a `LagrangianSystem` or in a `force` is, is
-    estimated at the start of the solve alone (a relaxation of 1 over a step): if it
-    grows, choose the step by `choose_step` from a solve that saves the same times. With
-    `StepDensityController` values with such friction are shorter steps. The force must
-    have two derivatives by `jax.jvp`.
+    momenta by more than a radian. The statistics say how many values are interpolated,
+    `sol.stats["interpolated"]`. How strong friction by place or by speed, of a
+    `LagrangianSystem` or in a `force` is, is estimated at the start of the solve alone
+    (a relaxation of 1 over a step): if it grows, choose the step by `choose_step` from
+    a solve that saves the same times. With `StepDensityController` values with such
+    friction are shorter steps. The force must have two derivatives by `jax.jvp`.
 
     A solve whose final or saved states are not finite fails; of an explicit scheme it
     ends at the next saved time or end of a step that is used for one, as other steps

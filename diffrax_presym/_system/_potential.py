@@ -60,7 +60,9 @@ class QuadraticPotential(AbstractPotential):
             - An array with one dimension more than `q`: a symmetric matrix for each
                 vector over the last axis of `q`.
             - A pytree of the structure of `q`, whose leaves are any of the above.
-            - A symmetric `lineax.AbstractLinearOperator` acting on `q`'s space.
+            - A symmetric `lineax.AbstractLinearOperator` acting on `q`'s space, such as
+                the stencil of a grid as a `lineax.FunctionLinearOperator`, whose
+                function may close over parameters to be differentiated.
 
         **Raises:**
 
