@@ -43,17 +43,19 @@ class EntryFriction(eqx.Module):
         else:
             effect = by_powers(self.terms, t, h, order)
             effect = effect or by_quadrature(self.terms, t, h, order)
-        singular = [(*term, term[0].is_singular(t)) for term in self.terms]
-        strengths = [
-            jnp.where(here, law.strength * rate, 0)
-            for law, rate, here in singular
-            if here is not None
-        ]
-        if not strengths:
+        strength = self._singular_strength(t)
+        if strength is None:
             return effect
         # No motion starts from infinite growth.
-        grows = functools.reduce(jnp.add, strengths) < 0
-        return effect._replace(change=jnp.where(grows, jnp.nan, effect.change))
+        change = jnp.where(strength < 0, jnp.nan, effect.change)
+        return effect._replace(change=change)
+
+    def _singular_strength(self, t: Time) -> Array | None:
+        """Of the rates that are infinite at `t`, the limit of their sum times the time
+        since; `None` if they never are."""
+        each = [(law.is_singular(t), law.strength * rate) for law, rate in self.terms]
+        known = [jnp.where(here, x, 0) for here, x in each if here is not None]
+        return functools.reduce(jnp.add, known) if known else None
 
     def fix(self, effects: Sequence[Effect]) -> Sequence[Effect]:
         return effects
@@ -72,15 +74,12 @@ class EntryFriction(eqx.Module):
         finite = lambda x: jnp.where(jnp.isinf(x), 0, x)
         lost = sum(rate * cast_to(finite(x), p) for _, rate, x in rates)
         net = force - lost * p
-        if self.is_singular(t) is None:
+        strength = self._singular_strength(t)
+        if strength is None:
             return net
         singular = [jnp.isinf(x) & (rate != 0) for _, rate, x in rates]
-        strength = sum(
-            jnp.where(s, law.strength * rate, 0)
-            for (law, rate, _), s in zip(rates, singular, strict=True)
-        )
         # Of motion from rest p grows like F t / (1 + gamma). No other has a limit.
-        limit = jnp.where(p == 0, force / (1 + strength), jnp.nan)
+        limit = jnp.where(p == 0, force / (1 + cast_to(strength, p)), jnp.nan)
         return jnp.where(functools.reduce(jnp.logical_or, singular), limit, net)
 
     def growth(self, t: Time, h: Time) -> Scalar:
