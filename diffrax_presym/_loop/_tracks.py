@@ -234,8 +234,6 @@ def _put_here(axis: int) -> Callable[..., Array]:
 
     @one.def_vmap
     def _(size: int, batched: list[bool], xs, x, i, here):
-        if not any(batched):  # but derivatives are, of which JAX takes another batch
-            return put(xs, i, x, here, axis), False
         each = lambda x, known: x if known else stack(x, size)
         xs, x = map(each, (xs, x), batched[:2])
         if not (batched[2] or batched[3]):
