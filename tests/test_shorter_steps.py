@@ -234,14 +234,15 @@ def test_second_derivatives_of_a_batch_by_its_friction():
         law = dps.ConstantDamping(0.1 * k)
         sol: Any = dfx.diffeqsolve(
             dps.MechanicalSystem(dps.QuadraticKinetic(), well, law),
-            *(dps.BlanesMoanRKN4(), 0.0, 1.0, 0.2, (jnp.ones(2), jnp.zeros(2))),
+            *(dps.PresymplecticYoshida4(), 0.0, 1.0, 0.2, (jnp.ones(2), jnp.zeros(2))),
             saveat=dfx.SaveAt(ts=jnp.array([0.13, 0.5, 0.77])),
             adjoint=dps.FixedStepAdjoint(),
         )
         return jnp.sum(sol.ys[0] ** 2)
 
-    ks, h, slope = jnp.array([1.0, 40.0]), 1e-5, jax.jit(jax.grad(total))
-    got = jax.jit(jax.vmap(jax.hessian(total)))(ks)
+    ks, h, slope = jnp.array([1.0, 1.5]), 1e-5, jax.jit(jax.grad(total))
+    second = lambda k: jax.jvp(jax.grad(total), (k,), (1.0,))[1]
+    got = jax.jit(jax.vmap(second))(ks)
     wanted = [(slope(k + h) - slope(k - h)) / (2 * h) for k in ks]
     np.testing.assert_allclose(got, wanted, rtol=1e-5)
 

@@ -150,12 +150,17 @@ def test_the_effect_does_not_depend_on_the_order_of_laws():
             np.testing.assert_allclose(effect, effects[0], rtol=1e-12)
 
 
-def pendulum(law, t0, t1, n, ts, y0=(1.0, 0.0), adjoint: Any = OWN) -> Any:
+RKN4 = dps.BlanesMoanRKN4()
+
+
+def pendulum(
+    law, t0, t1, n, ts, y0=(1.0, 0.0), adjoint: Any = OWN, solver: Any = RKN4
+) -> Any:
     system = dps.MechanicalSystem(
         dps.QuadraticKinetic(), lambda t, q, args: -jnp.sum(jnp.cos(q)), law
     )
     y0 = tuple(jnp.asarray([y]) for y in y0)
-    solve = (system, dps.BlanesMoanRKN4(), t0, t1, (t1 - t0) / n, y0)
+    solve = (system, solver, t0, t1, (t1 - t0) / n, y0)
     options = {"throw": False, "max_steps": 200}
     saveat = dfx.SaveAt(ts=jnp.asarray(ts))
     return dfx.diffeqsolve(*solve, saveat=saveat, adjoint=adjoint, **options)
@@ -217,8 +222,8 @@ GROWING += ([dps.LogDamping(1.0), dps.LogDamping(-2.0)],)
 
 @pytest.mark.parametrize("laws", GROWING)
 def test_infinite_growth_at_the_start_fails(laws):
-    assert pendulum(laws, 0.0, 1.0, 20, [1.0]).result != dfx.RESULTS.successful
-    less = [*laws, dps.LogDamping(3.0)]
+    solve = lambda laws: pendulum(laws, 0.0, 1.0, 20, [1.0], solver=dps.Strang())
+    assert solve(laws).result != dfx.RESULTS.successful
     known = not isinstance(laws[0], dps.PowerDamping)
-    sol = pendulum(less, 0.0, 1.0, 20, [1.0])
+    sol = solve([*laws, dps.LogDamping(3.0)])
     assert (sol.result == dfx.RESULTS.successful) == known
