@@ -90,8 +90,9 @@ MUTANTS = [
         "_scheme/_compensated.py", "end_force=lambda carry: base.end_force(carry[0]),",
         "end_force=lambda carry: base.end_force(carry[1][0]),",
         ("Diffrax's loop, dense", "Compensated")),
-    Mutant("a stage backwards in time may amplify without limit", "_scheme/_engine.py",
-        "-span.h) > -math.log(friction.precision) / 2", "-span.h) > math.inf",
+    Mutant("a stage backwards in time may amplify without limit",
+        "_scheme/_prepare.py", "each > -math.log(friction.precision) / 2",
+        "each > math.inf",
         tests="test_strong_friction.py"),
     # The loop and its gradient.
     Mutant("a saved row is shifted by one", "_loop/_tracks.py",

@@ -26,7 +26,7 @@ from jax.flatten_util import ravel_pytree
 from rows import covering, pairs, sample
 
 import diffrax_presym as dps
-from diffrax_presym._scheme import _engine as engine
+from diffrax_presym._scheme import _prepare as prepare
 
 
 NUMBERS = [4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256]
@@ -149,7 +149,7 @@ def interpolates(run: Run, solver) -> bool:
     system = dps.extend.System(run.system, None, 1, run.y0)
     if system.friction is None or system.friction.is_known:
         return False
-    return engine._number(solver.scheme(system).moves) > engine.NODES
+    return prepare._number(solver.scheme(system).moves) > prepare.NODES
 
 
 def last(ys):

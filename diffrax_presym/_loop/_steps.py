@@ -15,8 +15,9 @@ from .. import _tree as tree
 from .._checks import as_finite
 from .._numbers import cast_to
 from .._scheme._base import advance, Scheme
-from .._scheme._engine import backward, is_autonomous, prepare, prepare_once, Span
+from .._scheme._engine import backward, is_autonomous, Span
 from .._scheme._failure import explain, unless_too_strong
+from .._scheme._prepare import prepare, prepare_once
 from .._system._bound import System
 from ._base import AbstractSteps, follows, MOST_STEPS, Stop
 

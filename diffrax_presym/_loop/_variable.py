@@ -16,7 +16,8 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from .. import _tree as tree
 from .._scheme._base import advance, check_step, Point
-from .._scheme._engine import backward, first_failure, prepare, Span
+from .._scheme._engine import backward, first_failure, Span
+from .._scheme._prepare import prepare
 from .._step_size._density import StepDensityController
 from ._base import AbstractSteps, MOST_STEPS, Stop
 from ._tracks import AbstractTrack, put, stack, where_any

@@ -23,12 +23,12 @@ from ._engine import (
     leaves,
     Moves,
     MoveSequence,
-    prepare,
     Result,
     Span,
 )
 from ._failure import explain, unless_too_strong
 from ._moves import Drift, Enter, Kick
+from ._prepare import prepare
 from ._strong_friction import Pattern
 
 

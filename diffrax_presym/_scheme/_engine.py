@@ -7,7 +7,6 @@ time alone is prepared, for all stages at once, and what touches the state is ap
 
 import abc
 import itertools
-import math
 from collections.abc import Callable, Sequence
 from typing import ClassVar, NamedTuple, TypeAlias
 
@@ -20,9 +19,6 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .. import _tree as tree
-from .._friction._linear import Effects
-from .._friction._over_step import NODES
 from .._numbers import cast_to
 from .._system._bound import System
 
@@ -160,112 +156,6 @@ def is_autonomous(moves: Moves, system: System) -> bool:
     if not isinstance(moves, MoveSequence):
         return moves.is_autonomous(system)
     return all(is_autonomous(move, system) for move in moves.moves)
-
-
-def prepare(moves: Moves, system: System, span: Span, backward: bool = False) -> PyTree:
-    """What all moves need of time alone, for a step: of the inverses if `backward`."""
-    exact = lambda: _prepare(moves, system, span, backward)
-    if system.friction is None or _number(moves) <= NODES:
-        return exact()
-    first, last = _extent(moves)
-    whole = span.part(first, last, last - first)
-    found = system.friction.over_step(whole.t0, whole.h)
-    if found is None:
-        return exact()
-    friction, converged = found
-    fast = eqx.tree_at(lambda system: system.friction, system, friction)
-    # Of a batch as one: otherwise each member would compute both.
-    all_converged = ~tree.any_member(~converged)
-    return lax.cond(all_converged, lambda: _prepare(moves, fast, span, backward), exact)
-
-
-def _number(moves: Moves) -> int:
-    """Of moves in a step."""
-    if not isinstance(moves, MoveSequence):
-        return 1
-    return len(moves.table) * sum(map(_number, moves.moves))
-
-
-def _extent(moves: Moves) -> tuple[float, float]:
-    """The first and the last time of any move, in units of the step."""
-    if not isinstance(moves, MoveSequence):
-        return 0.0, 1.0
-    times = [0.0, 1.0]
-    for i, move in enumerate(moves.moves):
-        for start, end, _ in moves.table[:, i]:
-            times += [start + x * (end - start) for x in _extent(move)]
-    return float(min(times)), float(max(times))
-
-
-def _prepare(moves: Moves, system: System, span: Span, backward: bool) -> PyTree:
-    if not isinstance(moves, MoveSequence):
-        return moves.prepare(system, span.reversed if backward else span)
-
-    def column(move: Moves, rows: np.ndarray) -> PyTree:
-        which = np.arange(len(rows))
-        if is_autonomous(move, system):
-            lengths = np.round(rows[:, 2], 15)
-            _, first, which = np.unique(lengths, return_index=True, return_inverse=True)
-            order = np.argsort(first)  # as they come
-            rows, which = rows[first[order]], np.argsort(order)[which]
-
-        def one(*row) -> PyTree:
-            part = span.part(*row)
-            data = _prepare(move, system, part, backward)
-            returns = not backward and np.any(rows[:, 1] < rows[:, 0])
-            return _unless_amplified(system, part, data) if returns else data
-
-        if len(rows) == 1:
-            row = one(*rows[0].tolist())
-            data = jtu.tree_map(lambda x: jnp.expand_dims(x, 0), row)
-        else:
-            data = jax.vmap(one)(*(cast_to(x, span.h) for x in rows.T))
-        if len(rows) == len(which):
-            return data
-        return jtu.tree_map(lambda x: _rows(x, which.tolist()), data)
-
-    columns = zip(moves.moves, np.moveaxis(moves.table, 1, 0), strict=True)
-    return [column(*x) for x in columns]
-
-
-def _rows(x: Array, which: list[int]) -> Array:
-    """`x[which]`, by slices: the transpose of an index is a scattered addition, with
-    which XLA does not compile a loop to one function."""
-    parts, i = [], 0
-    while i < len(which):
-        # As many as go up, or down, by one.
-        first, down = which[i], which[i + 1 : i + 2] == [which[i] - 1]
-        ahead = enumerate(first - k if down else k - first for k in which[i:])
-        number = next((n for n, k in ahead if k != n), len(which) - i)
-        low = first - number + 1 if down else first
-        part = x[low : low + number]
-        parts.append(jnp.flip(part, 0) if down else part)
-        i += number
-    return jnp.concatenate(parts)
-
-
-def prepare_once(
-    moves: Moves, system: System, span: Span, backward: bool = False
-) -> PyTree:
-    """The same for all steps of one length, in a form that is applied faster."""
-    data, friction = prepare(moves, system, span, backward), system.friction
-    if friction is None:
-        return data
-    is_effects = lambda x: isinstance(x, Effects) and not x.is_fixed
-    leaves, structure = jtu.tree_flatten(data, is_leaf=is_effects)
-    fixed = iter(friction.fix(list(filter(is_effects, leaves))))
-    leaves = [next(fixed) if is_effects(x) else x for x in leaves]
-    return structure.unflatten(leaves)
-
-
-def _unless_amplified(system: System, span: Span, data: PyTree) -> PyTree:
-    """What was prepared for a stage, not finite if the stage goes back in time and
-    friction amplifies rounding errors there beyond half of the digits."""
-    if system.friction is None:
-        return data
-    friction = tree.stop_gradient(system.friction)
-    bad = friction.growth(span.t1, -span.h) > -math.log(friction.precision) / 2
-    return tree.invalid_if(bad, data)
 
 
 def forward(

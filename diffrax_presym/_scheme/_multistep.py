@@ -19,8 +19,9 @@ from .._numbers import cast_to, State
 from .._results import MULTISTEP_UNSTABLE, OTHER_HISTORY
 from .._system._bound import System
 from ._base import AbstractPresymplecticSolver, Scheme
-from ._engine import AbstractMove, forward, Outcome, prepare, Span, StepState
+from ._engine import AbstractMove, forward, Outcome, Span, StepState
 from ._find_split import find_split
+from ._prepare import prepare
 from ._splitting import BlanesCasasRKN8
 
 
