@@ -40,7 +40,10 @@ def prepare(moves: Moves, system: System, span: Span, backward: bool = False) ->
     fast = eqx.tree_at(lambda system: system.friction, system, friction)
     # Of a batch as one: otherwise each member would compute both.
     all_converged = ~tree.any_member(~converged)
-    return lax.cond(all_converged, lambda: _prepare(moves, fast, span, backward), exact)
+    # A derivative computes either again: to keep what both consist of takes longer.
+    kept = lambda fn: jax.checkpoint(fn, prevent_cse=False)
+    nearby = lambda: _prepare(moves, fast, span, backward)
+    return lax.cond(all_converged, kept(nearby), kept(exact))
 
 
 def prepare_once(
