@@ -71,7 +71,8 @@ OFF_MANIFOLD = {
         f"off_manifold_{most:.0e}",
         f"The initial state is off the manifold of the system by more than {most:.0e}, "
         "in positions, or relative to their size in velocities, off its tangent space: "
-        "by `system.violation(t0, *y0, args)`. Pass `system.project(t0, y0, args)`.",
+        "by `system.violation(t0, *y0, args)`. Pass `system.project(t0, y0, args)`, "
+        "with `y0` in the precision of the times if that is higher.",
     )
     for most in (1e-8, 1e-5, 1e-2, 10.0)
 }

@@ -48,5 +48,5 @@ def find_split(
         "`QuadraticKinetic(mass)`, or a quadratic potential, written as "
         "`QuadraticPotential(stiffness)`; and for friction that depends neither on "
         "positions nor on the speed, without a `force=f` of the velocity. Otherwise "
-        "use `Strang()`, `BlanesMoan4()` or `BlanesMoan6()`."
+        "use `Strang()`, `BlanesMoan4()`, `BlanesMoan6()` or `PresymplecticGauss()`."
     )

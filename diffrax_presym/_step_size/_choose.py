@@ -51,7 +51,8 @@ class ChosenStep(NamedTuple):
             " The errors do not fall as those of a smooth motion, and may be larger "
             "than expected. If the force has kinks, or the friction jumps, at known "
             "times, write `stepsize_controller=StepsBetween(times)`; where a force "
-            "jumps, end the solve and begin another."
+            "jumps, end the solve and begin another; where it changes fast at unknown "
+            "times, as dry friction that is smoothed, use an adaptive solver."
         )
         limit = (
             " Steps that are not much longer are unstable, or miss an event: for other "
