@@ -34,8 +34,8 @@ def solve_by(solver, **options):
     return jax.jit(
         lambda dt0: dfx.diffeqsolve(
             *(SYSTEM, solver, 0.0, 10.0, dt0, Y0),
-            **{"saveat": dfx.SaveAt(ts=TS), "max_steps": None, "throw": False},
-            **options,
+            **{"saveat": dfx.SaveAt(ts=TS), "max_steps": None, "throw": False}
+            | options,
         )
     )
 
@@ -155,3 +155,19 @@ def test_bad_input(solves, options, error, message):
     given = {"rtol": 1e-6, "atol": 1e-6} | options
     with pytest.raises(error, match=message):
         work_precision(solves, 0.0, 10.0, **given)
+
+
+def test_solves_that_save_other_times_are_refused():
+    """Their values would be broadcast, and one of them be missing from the table."""
+    end = solve_by(dps.TunedRKN6(), saveat=dfx.SaveAt(t1=True))
+    with pytest.raises(ValueError, match="must save the same"):
+        work_precision({"end": end, "all": TUNED}, 0.0, 10.0, rtol=1e-4, atol=1e-4)
+
+
+def test_a_solve_that_is_never_near_the_tolerance_is_named():
+    few = solve_by(dps.PresymplecticLeapfrog(), max_steps=8)
+    result = work_precision(
+        {"tuned": TUNED, "few": few}, 0.0, 10.0, rtol=1e-4, atol=1e-4, decades=1
+    )
+    assert {run.name for run in result.runs} == {"tuned"}
+    assert result.missing == ("few",) and "tolerance: few" in str(result)

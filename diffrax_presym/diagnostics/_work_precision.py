@@ -48,10 +48,12 @@ class WorkPrecision(NamedTuple):
     - `runs`: a `diagnostics.WorkPrecisionRun` for each solve and each of its steps or
         tolerances.
     - `reference`: the name of the solve whose finest solution the errors refer to.
+    - `missing`: the names of the solves whose errors were never within the `decades`.
     """
 
     runs: tuple[WorkPrecisionRun, ...]
     reference: str
+    missing: tuple[str, ...] = ()
 
     def fastest(self, error: float = 1.0) -> WorkPrecisionRun:
         """The fastest run whose error is at most so many times the tolerance.
@@ -74,6 +76,8 @@ class WorkPrecision(NamedTuple):
             for run in self.runs
         ]
         lines.append(f"errors over the tolerance, against {self.reference!r}")
+        if self.missing:
+            lines.append(f"never near the tolerance: {', '.join(self.missing)}")
         return "\n".join(lines)
 
 
@@ -134,7 +138,8 @@ def work_precision(
 
     **Raises:**
 
-    `ValueError` if an argument is not valid; `RuntimeError` if no solve converges.
+    `ValueError` if an argument is not valid, or the solves do not save the same;
+    `RuntimeError` if no solve converges.
     """
     t0, t1 = check_times(t0, t1, "work_precision")
     tolerance = (
@@ -177,7 +182,9 @@ def work_precision(
         WorkPrecisionRun(name, error, seconds, number, x)
         for (name, error, number, x), seconds in rows
     )
-    return WorkPrecision(runs, reference)
+    found = {run.name for run in runs}
+    missing = tuple(name for name, *_ in tasks if name not in found)
+    return WorkPrecision(runs, reference, missing)
 
 
 def _measured(
@@ -208,6 +215,13 @@ def _ladder(max_steps: int):
 def _error(solution: Solution, exact: list[np.ndarray], tolerance) -> float:
     if not solution.finite:
         return np.inf
+    shapes = [[np.shape(x) for x in each] for each in (solution.leaves, exact)]
+    if shapes[0] != shapes[1]:
+        raise ValueError(
+            "The solves of `work_precision` must save the same, but one saves arrays "
+            f"of shapes {shapes[0]} and another of shapes {shapes[1]}. Pass the same "
+            "`saveat` to all."
+        )
     return scaled_error(solution.leaves, exact, *tolerance)
 
 
