@@ -262,3 +262,35 @@ def test_no_operation_keeps_a_loop_from_being_one_function(options):
     gradient = jax.grad(lambda inputs: value(inputs, dps.FixedStepAdjoint(), options))
     text = str(jax.jit(gradient).lower(INPUTS).compile().as_text())
     assert "while" in text and apart.search(text) is None
+
+
+@pytest.mark.parametrize("gradient", ["reversal", "checkpoints"])
+@pytest.mark.parametrize("varies", [False, True])
+def test_a_member_that_fails_at_its_start_adds_nothing(varies, gradient):
+    """Neither its force there has derivatives, nor the length of its first step."""
+    well = lambda t, q, args: -args / jnp.sqrt(jnp.sum(q**2))
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), well)
+    controller = dps.StepDensityController(0.2, system)
+    options = dict(dt0=None, stepsize_controller=controller) if varies else {}
+
+    def total(starts, strength):
+        def one(start):
+            sol: Any = dfx.diffeqsolve(
+                *(system, dps.TunedRKN6(), 0.0, 4.0),
+                y0=(jnp.stack([start, 0.0 * start]), jnp.array([0.0, 1.0])),
+                args=strength,
+                adjoint=dps.FixedStepAdjoint(gradient),
+                throw=False,
+                **{"dt0": 0.05, "max_steps": 100, **options},
+            )
+            good = sol.result == dfx.RESULTS.successful
+            return jnp.sum(jnp.where(good, sol.ys[0], 0.0) ** 2), good
+
+        squares, good = jax.vmap(one)(starts)
+        return jnp.sum(squares), good
+
+    slope = jax.jit(jax.grad(total, 1, has_aux=True))
+    got, good = slope(jnp.array([1.0, 0.0, jnp.nan]), 1.0)
+    assert good.tolist() == [True, False, False]
+    wanted, _ = slope(jnp.ones(1), 1.0)
+    assert got == pytest.approx(float(wanted), rel=1e-12)

@@ -9,8 +9,10 @@ import equinox.internal as eqxi
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jaxtyping import PyTree
 
 from .._checks import as_positive
+from .._numbers import State
 from .._scheme._base import AbstractPresymplecticSolver, Point, Scheme
 from .._step_size._density import StepDensityController
 from .._system._bound import bind
@@ -120,7 +122,6 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         passed_controller_state,
         progress_meter,
     ):
-        del passed_solver_state
         y, carry, made_jump, meter, control = private.start_of(init_state)
         # Of friction at a place it has the user's objects, whose fields may be numbers.
         carry = jtu.tree_map(jnp.asarray, carry)
@@ -139,11 +140,24 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
             steps = VariableSteps(t0, t1, stepsize_controller, dt0)
         else:
             steps = Steps(stepsize_controller, t0, t1, dt0)
+        start, known = steps.join(carry, control), (carry, control)
+
+        def begin(y: State) -> PyTree:
+            """What a solve begins with besides the state."""
+            carry, control = known
+            if not passed_solver_state:
+                carry = scheme.start(system, system.time(t0), y)
+            if isinstance(steps, VariableSteps) and not passed_controller_state:
+                about = dt0, args, solver.func, None
+                _, control = steps.controller.init(terms, t0, t1, y, *about)
+            return steps.join(carry, control)
+
         problem = Problem(
             solver,
             system,
             subs,
-            (y, steps.join(carry, control)),
+            (y, lax.stop_gradient(start)),
+            begin if jtu.tree_leaves(start) else None,
             steps,
             max_steps,
             (progress_meter, meter),
@@ -316,7 +330,7 @@ def _solve_bwd(trace, bars, perturbed, inputs, way: Reversal | Checkpoints):
     ]
     bars = saved_bars, carry_bar, pulls(problem)
     backward = Backward(problem, trace, perturbed[0].functions, *bars)
-    at = way.pull_back(backward)
+    at = backward.begin(way.pull_back(backward))
     # What is not used of a solve that failed, as a member of a batch, adds nothing.
     used = [jnp.any(x != 0) for x in jtu.tree_leaves((saved_bars, carry_bar))]
     used = reduce(jnp.logical_or, used, jnp.asarray(False))

@@ -104,6 +104,15 @@ class Backward(eqx.Module):
                 at = at.add(*self._pull_point(i, at.n, at.point, row))
         return at
 
+    def begin(self, at: BackwardState) -> BackwardState:
+        """Pull back what the solve begins with besides the state."""
+        moved, fixed = self._functions
+        if self.problem.functions.begin is None:
+            return at
+        redo = lambda moved, y: eqx.combine(moved, fixed).begin(y)
+        _, (more, bar) = _vjp(at.n, redo, at.bar[1], moved, self.problem.start[0])
+        return at.add(more, (bar, zeros(at.bar[1])))
+
     def back_to(self, at: BackwardState, first: Array, start: Start) -> BackwardState:
         """All steps back to the start of step `first`, and what was saved there."""
         # Members of a batch may have ended before.

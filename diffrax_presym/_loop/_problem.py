@@ -29,6 +29,9 @@ class Functions(eqx.Module):
     gradients reach it, however the function is written.
     """
 
+    # What a solve begins with besides the state, if anything: differentiated here, a
+    # member of a batch that fails at its start adds nothing.
+    begin: Callable[[State], PyTree] | None
     step: Callable[[Array, Point], tuple[Point, Result]]
     # The state within a step, if any is saved.
     shorter: Callable[[Array, Point, Array], State] | None
@@ -64,6 +67,7 @@ class Problem(eqx.Module):
         system: System,
         subs: list[dfx.SubSaveAt],
         start: Point,
+        begin: Callable[[State], PyTree] | None,
         steps: AbstractSteps,
         max_steps: int | None,
         meters: tuple[dfx.AbstractProgressMeter, PyTree],
@@ -112,7 +116,8 @@ class Problem(eqx.Module):
         ]
         within = convert(shorter, n, start, t0) if some else None
         several = within, at_node, at_end, outputs
-        self.functions = Functions(convert(step, n, start), *several)
+        begins = None if begin is None else convert(begin, start[0])
+        self.functions = Functions(begins, convert(step, n, start), *several)
         self.start = start
         # Computed, so that it has the sharding of others within `jax.shard_map`.
         result = dfx.RESULTS.where(n < 0, NONFINITE, dfx.RESULTS.successful)
