@@ -294,3 +294,22 @@ def test_a_member_that_fails_at_its_start_adds_nothing(varies, gradient):
     assert good.tolist() == [True, False, False]
     wanted, _ = slope(jnp.ones(1), 1.0)
     assert got == pytest.approx(float(wanted), rel=1e-12)
+
+
+@pytest.mark.parametrize("gradient", ["reversal", "checkpoints"])
+def test_one_motion_seen_from_several_places(gradient):
+    """A batch of what is saved alone, of one motion."""
+
+    def total(stiffness, place):
+        seen = dfx.SubSaveAt(ts=TS, fn=lambda t, y, args: y[0] - place)
+        sol: Any = solve(
+            (Y0, GAMMA, stiffness),
+            dps.FixedStepAdjoint(gradient),
+            saveat=dfx.SaveAt(subs=[seen, dfx.SubSaveAt(t1=True)]),
+        )
+        return jnp.sum(sol.ys[0] ** 2) + jnp.sum(sol.ys[1][0] ** 2)
+
+    places, slope = jnp.arange(3.0), jax.grad(total)
+    together = lambda x: jnp.sum(jax.vmap(total, (None, 0))(x, places))
+    wanted = sum(slope(STIFFNESS, place) for place in places)
+    assert_close(jax.grad(together)(STIFFNESS), wanted, 1e-12)

@@ -298,8 +298,19 @@ def _outputs(problem: Problem, buffers, out):
     (progress, result, values), trace = out
     each = zip(trace.rows, buffers, values, strict=True)
     saved = [saved_rows(problem, i, *x, progress) for i, x in enumerate(each)]
-    about = progress.meter, trace.interpolated
-    return progress.point, saved, progress.n, result, *about
+    differentiated = progress.point, saved
+    about = progress.n, result, progress.meter, trace.interpolated
+    return *_alike(differentiated), *about
+
+
+def _alike(x: PyTree) -> PyTree:
+    """`x`, of which all is a batch if something is. Otherwise, where only what is saved
+    depends on the member, JAX would add up gradients of the rest, or refuse to."""
+    floats = [y for y in jtu.tree_leaves(x) if eqx.is_inexact_array(y) and y.size]
+    firsts = [jnp.isnan(jnp.ravel(y)[0]) for y in floats]
+    any_nan = reduce(jnp.logical_or, firsts, jnp.asarray(False))
+    alike = lambda y: jnp.where(any_nan, y, y) if eqx.is_inexact_array(y) else y
+    return jtu.tree_map(alike, x)
 
 
 @_solve.def_fwd
