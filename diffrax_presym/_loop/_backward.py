@@ -106,9 +106,9 @@ class Backward(eqx.Module):
 
     def begin(self, at: BackwardState) -> BackwardState:
         """Pull back what the solve begins with besides the state."""
-        moved, fixed = self._functions
         if self.problem.functions.begin is None:
             return at
+        moved, fixed = self._functions
         redo = lambda moved, y: eqx.combine(moved, fixed).begin(y)
         _, (more, bar) = _vjp(at.n, redo, at.bar[1], moved, self.problem.start[0])
         return at.add(more, (bar, zeros(at.bar[1])))

@@ -95,9 +95,6 @@ class Inverse(AbstractMove):
 
     move: AbstractMove
 
-    def prepare(self, system: System, span: Span) -> PyTree:
-        return self.move.prepare(system, span)
-
     def is_autonomous(self, system: System) -> bool:
         return self.move.is_autonomous(system)
 

@@ -30,9 +30,9 @@ def prepare(moves: Moves, system: System, span: Span, backward: bool = False) ->
     exact = lambda: _prepare(moves, system, span, backward)
     if system.friction is None or _number(moves) <= NODES:
         return exact()
-    times = [rows[..., :2] for _, rows in _places(moves)]
-    first, last = (f([0.0, 1.0, *map(f, times)]) for f in (np.min, np.max))
-    whole = span.part(float(first), float(last), float(last - first))
+    times = _flat([rows for _, rows in _places(moves)])[:, :2]
+    first, last = float(np.min(times)), float(np.max(times))
+    whole = span.part(first, last, last - first)
     found = system.friction.over_step(whole.t0, whole.h)
     if found is None:
         return exact()
@@ -40,10 +40,10 @@ def prepare(moves: Moves, system: System, span: Span, backward: bool = False) ->
     fast = eqx.tree_at(lambda system: system.friction, system, friction)
     # Of a batch as one: otherwise each member would compute both.
     all_converged = ~tree.any_member(~converged)
-    # A derivative computes either again: to keep what both consist of takes longer.
-    kept = lambda fn: jax.checkpoint(fn, prevent_cse=False)
     nearby = lambda: _prepare(moves, fast, span, backward)
-    return lax.cond(all_converged, kept(nearby), kept(exact))
+    # A derivative computes either again: to keep what both consist of takes longer.
+    again = functools.partial(jax.checkpoint, prevent_cse=False)
+    return lax.cond(all_converged, again(nearby), again(exact))
 
 
 def prepare_once(
