@@ -105,6 +105,16 @@ def invalid_if(bad: Bool[Array, ""], y: PyTree) -> PyTree:
     return scale(jnp.where(bad, jnp.nan, 1.0), y)
 
 
+def all_batched(x: PyTree) -> PyTree:
+    """`x`, whose numbers are all batched by `jax.vmap` if some are."""
+    is_number = lambda y: eqx.is_inexact_array(y) and y.size > 0
+    numbers = filter(is_number, jtu.tree_leaves(x))
+    either = jnp.asarray(False)
+    for y in numbers:
+        either |= jnp.isnan(jnp.ravel(y)[0])
+    return jtu.tree_map(lambda y: jnp.where(either, y, y) if is_number(y) else y, x)
+
+
 def stop_gradient(x: PyTree) -> PyTree:
     arrays, other = eqx.partition(x, eqx.is_array)
     return eqx.combine(lax.stop_gradient(arrays), other)

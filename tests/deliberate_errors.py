@@ -285,7 +285,7 @@ MUTANTS = [
         "number = problem.rows[i].first_left(backward.trace.n) - 1",
         ("times", "reversal")),
     Mutant("a motion that members share counts for each", "_loop/_adjoint.py",
-        "return *_alike(differentiated), *about", "return *differentiated, *about",
+        "tree.all_batched((progress.point, saved))", "(progress.point, saved)",
         tests="test_adjoint.py", only="several_places"),
     Mutant("what a solve begins with is differentiated outside",
         "_loop/_adjoint.py", "(y, lax.stop_gradient(start)),", "(y, start),",

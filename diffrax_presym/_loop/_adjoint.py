@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import PyTree
 
+from .. import _tree as tree
 from .._checks import as_positive
 from .._numbers import State
 from .._scheme._base import AbstractPresymplecticSolver, Point, Scheme
@@ -298,19 +299,10 @@ def _outputs(problem: Problem, buffers, out):
     (progress, result, values), trace = out
     each = zip(trace.rows, buffers, values, strict=True)
     saved = [saved_rows(problem, i, *x, progress) for i, x in enumerate(each)]
-    differentiated = progress.point, saved
-    about = progress.n, result, progress.meter, trace.interpolated
-    return *_alike(differentiated), *about
-
-
-def _alike(x: PyTree) -> PyTree:
-    """`x`, of which all is a batch if something is. Otherwise, where only what is saved
-    depends on the member, JAX would add up gradients of the rest, or refuse to."""
-    floats = [y for y in jtu.tree_leaves(x) if eqx.is_inexact_array(y) and y.size]
-    firsts = [jnp.isnan(jnp.ravel(y)[0]) for y in floats]
-    any_nan = reduce(jnp.logical_or, firsts, jnp.asarray(False))
-    alike = lambda y: jnp.where(any_nan, y, y) if eqx.is_inexact_array(y) else y
-    return jtu.tree_map(alike, x)
+    # Otherwise, of a batch of what is saved alone, JAX would add up the gradients of
+    # the motion, or refuse to.
+    point, saved = tree.all_batched((progress.point, saved))
+    return point, saved, progress.n, result, progress.meter, trace.interpolated
 
 
 @_solve.def_fwd
@@ -346,7 +338,7 @@ def _solve_bwd(trace, bars, perturbed, inputs, way: Reversal | Checkpoints):
     used = [jnp.any(x != 0) for x in jtu.tree_leaves((saved_bars, carry_bar))]
     used = reduce(jnp.logical_or, used, jnp.asarray(False))
     found = jtu.tree_map(lambda x: jnp.where(used, x, 0), (at.gradient, at.bar))
-    none = lambda tree: jtu.tree_map(lambda _: None, tree)
+    none = lambda x: jtu.tree_map(lambda _: None, x)
     where = lambda x: (x.functions, x.start)
     gradient = eqx.tree_at(where, none(problem), found, is_leaf=_none)
     return gradient, none(buffers)
