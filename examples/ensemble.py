@@ -106,10 +106,10 @@ def collectives(program):
     return found[True], found[False]
 
 
-def described(program):
+def described(program, iteration="in each step"):
     each = lambda found: ", ".join(f"{n} {name}" for name, n in found.items())
     inside, outside = map(each, collectives(program))
-    found = [f"{inside} in each step"] * bool(inside)
+    found = [f"{inside} {iteration}"] * bool(inside)
     found += [f"{outside} in all"] * bool(outside)
     return " and ".join(found) or "none"
 
@@ -170,7 +170,10 @@ def patterns(sharding, y0):
     }
     print("\nCommunication in the compiled program of a solve with")
     for name, solve in cases.items():
-        print(f"  {name:34}{described(compiled(solve, sharding, y0))}", flush=True)
+        # A batch asks there whether all of its members are lost.
+        iteration = "at each saved time" if "ts" in name else "in each step"
+        found = described(compiled(solve, sharding, y0), iteration)
+        print(f"  {name:34}{found}", flush=True)
 
 
 def picture(path, n, q):

@@ -65,6 +65,8 @@ def test_over_devices(tmp_path):
     assert {name for name in rows if rows[name] == "none"} >= FREE
     # The search finds collective operations where they are expected.
     assert {name for name in rows if "in each step" in rows[name]} == IN_EACH_STEP
+    at_saved = {name for name in rows if "at each saved time" in rows[name]}
+    assert at_saved == {"constant steps, SaveAt(ts=...)"}
 
 
 @pytest.mark.slow
