@@ -157,7 +157,7 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
             solver,
             system,
             subs,
-            (y, lax.stop_gradient(start)),
+            (y, start),
             begin if jtu.tree_leaves(start) else None,
             steps,
             max_steps,
@@ -337,9 +337,11 @@ def _solve_bwd(trace, bars, perturbed, inputs, way: Reversal | Checkpoints):
     # What is not used of a solve that failed, as a member of a batch, adds nothing.
     used = [jnp.any(x != 0) for x in jtu.tree_leaves((saved_bars, carry_bar))]
     used = reduce(jnp.logical_or, used, jnp.asarray(False))
-    found = jtu.tree_map(lambda x: jnp.where(used, x, 0), (at.gradient, at.bar))
     none = lambda x: jtu.tree_map(lambda _: None, x)
-    where = lambda x: (x.functions, x.start)
+    where = lambda x: (x.functions, x.start[0], x.start[1])
+    found = jtu.tree_map(lambda x: jnp.where(used, x, 0), (at.gradient, at.bar[0]))
+    # What the solve begins with besides was pulled back: no zeros, which JAX would.
+    found = *found, none(problem.start[1])
     gradient = eqx.tree_at(where, none(problem), found, is_leaf=_none)
     return gradient, none(buffers)
 
