@@ -103,7 +103,8 @@ def test_what_converges_to_something_else_is_not_the_fastest(result):
 
 def test_what_is_printed_and_drawn(result):
     lines = str(result).splitlines()
-    assert len(lines) == len(result.runs) + 2
+    assert len(lines) == len(result.runs) + 3
+    assert lines[-1] == "never near the tolerance: wrong"
     axes = plot_work_precision(result)
     labels = {line.get_label() for line in axes.get_lines()}
     assert labels == {run.name for run in result.runs}
