@@ -15,7 +15,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Bool, PyTree
 
 from .. import _tree as tree
 from .._friction._linear import Effects, LinearFriction
@@ -97,26 +97,27 @@ def _prepare(moves: Moves, system: System, span: Span, backward: bool) -> PyTree
     same: dict[Any, list[int]] = {}
     for i, (move, _) in enumerate(each):
         leaves, structure = jtu.tree_flatten(move)
-        key = structure, tuple(map(id, leaves))
+        # What is prepared once for all steps is faster apart: XLA on a CPU distributes
+        # operations on more than 512 bytes over threads.
+        apart = i if is_autonomous(move, system) else None
+        key = structure, tuple(map(id, leaves)), apart
         same.setdefault(key, []).append(i)
 
+    bad = None
+    rows = [x for x in (_flat([x]) for _, x in places) if np.any(x[:, 1] < x[:, 0])]
+    if system.friction is not None and rows and not backward:
+        bad = _amplifies(system.friction, span, np.concatenate(rows))
     found: dict[int, PyTree] = {}
     for which in same.values():
         rows = [each[i][1] for i in which]
         flat, ends = _flat(rows), np.cumsum([x.size // 3 for x in rows])
         data, indices = _prepare_rows(each[which[0]][0], system, span, backward, flat)
+        data = data if bad is None else tree.invalid_if(bad, data)
         parts = zip(rows, np.split(indices, ends[:-1]), strict=True)
         take = [functools.partial(_rows, own.reshape(x.shape[:-1])) for x, own in parts]
         found |= {i: jtu.tree_map(f, data) for i, f in zip(which, take, strict=True)}
     numbered = iter(range(len(each)))
-    data = _nested(moves, lambda: found[next(numbered)])
-    if backward:
-        return data
-    rows = [_flat([rows]) for _, rows in places]
-    rows = [x for x in rows if np.any(x[:, 1] < x[:, 0])]
-    if system.friction is None or not rows:
-        return data
-    return _unless_amplified(system.friction, span, np.concatenate(rows), data)
+    return _nested(moves, lambda: found[next(numbered)])
 
 
 def _flat(places: list[np.ndarray]) -> np.ndarray:
@@ -167,11 +168,11 @@ def _rows(indices: np.ndarray, x: Array) -> Array:
     return jnp.concatenate(parts).reshape(*indices.shape, *x.shape[1:])
 
 
-def _unless_amplified(
-    friction: LinearFriction, span: Span, rows: np.ndarray, data: PyTree
-) -> PyTree:
-    """What was prepared for a step of which stages go back in time, not finite if
-    friction amplifies rounding errors in a stage beyond half of the digits."""
+def _amplifies(
+    friction: LinearFriction, span: Span, rows: np.ndarray
+) -> Bool[Array, ""]:
+    """Whether friction amplifies rounding errors in a stage of a step, of which some go
+    back in time, beyond half of the digits: what is prepared is then not finite."""
     # Of those within another stage, such as the moves of one, it is less.
     stages = {tuple(x) for x in rows.tolist()}
     within = lambda x, y: x != y and y[0] <= x[0] <= x[1] <= y[1]
@@ -184,5 +185,4 @@ def _unless_amplified(
         return friction.growth(part.t1, -part.h)
 
     each = jax.vmap(growth)(*(cast_to(x, span.h) for x in np.array(sorted(most)).T))
-    bad = jnp.any(each > -math.log(friction.precision) / 2)
-    return tree.invalid_if(bad, data)
+    return jnp.any(each > -math.log(friction.precision) / 2)
