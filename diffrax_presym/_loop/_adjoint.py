@@ -132,10 +132,10 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         scheme = solver.scheme(system)
         _check_history(solver, scheme, stepsize_controller)
         way = self._way(solver, scheme, (y, carry), max_steps, throw)
+        restart = lambda y: scheme.start(system, system.time(t0), y)
         if made_jump is not False:
             # The solver state is stale, and is recomputed before the first step.
-            restart = lambda: scheme.start(system, system.time(t0), y)
-            carry = lax.cond(made_jump, restart, lambda: carry)
+            carry = lax.cond(made_jump, restart, lambda _: carry, y)
         subs, structure = private.flatten_subs(saveat)
         if isinstance(stepsize_controller, StepDensityController):
             steps = VariableSteps(t0, t1, stepsize_controller, dt0)
@@ -147,7 +147,7 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
             """What a solve begins with besides the state."""
             carry, control = known
             if not passed_solver_state:
-                carry = scheme.start(system, system.time(t0), y)
+                carry = restart(y)
             if isinstance(steps, VariableSteps) and not passed_controller_state:
                 about = dt0, args, solver.func, None
                 _, control = steps.controller.init(terms, t0, t1, y, *about)

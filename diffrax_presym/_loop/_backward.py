@@ -108,10 +108,9 @@ class Backward(eqx.Module):
         """Pull back what the solve begins with besides the state."""
         if self.problem.functions.begin is None:
             return at
-        moved, fixed = self._functions
-        redo = lambda moved, y: eqx.combine(moved, fixed).begin(y)
-        _, (more, bar) = _vjp(at.n, redo, at.bar[1], moved, self.problem.start[0])
-        return at.add(more, (bar, zeros(at.bar[1])))
+        redo, y = (lambda functions, y: functions.begin(y)), self.problem.start[0]
+        gradient, bar = self.pull(at.n, redo, at.bar[1], y)
+        return at.add(gradient, (bar, zeros(at.bar[1])))
 
     def back_to(self, at: BackwardState, first: Array, start: Start) -> BackwardState:
         """All steps back to the start of step `first`, and what was saved there."""

@@ -103,10 +103,9 @@ def _prepare(moves: Moves, system: System, span: Span, backward: bool) -> PyTree
         key = structure, tuple(map(id, leaves)), apart
         same.setdefault(key, []).append(i)
 
-    bad = None
-    rows = [x for x in (_flat([x]) for _, x in places) if np.any(x[:, 1] < x[:, 0])]
-    if system.friction is not None and rows and not backward:
-        bad = _amplifies(system.friction, span, np.concatenate(rows))
+    bad, returning = None, [x for _, x in places if np.any(x[..., 1] < x[..., 0])]
+    if system.friction is not None and returning and not backward:
+        bad = _amplifies(system.friction, span, _flat(returning))
     found: dict[int, PyTree] = {}
     for which in same.values():
         rows = [each[i][1] for i in which]
