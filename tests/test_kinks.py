@@ -77,14 +77,14 @@ TABLE = system_of(
 BETWEEN = {"stepsize_controller": dps.StepsBetween(KNOTS[::-1])}
 
 
-def by_scipy(t0, t1, y):
+def by_scipy(t0, t1, y, knots=KNOTS, push=PUSH):
     """The state at `t1`, from knot to knot."""
 
     def rhs(t, y):
         q, p = np.split(y, 2)
-        return np.append(p, np.interp(t, KNOTS, PUSH) - np.sin(q) - 0.1 * p)
+        return np.append(p, np.interp(t, knots, push) - np.sin(q) - 0.1 * p)
 
-    inner = [t for t in KNOTS if min(t0, t1) < t < max(t0, t1)]
+    inner = [t for t in knots if min(t0, t1) < t < max(t0, t1)]
     for span in itertools.pairwise([t0, *(inner if t0 < t1 else inner[::-1]), t1]):
         sol = scipy.integrate.solve_ivp(rhs, span, y, "DOP853", rtol=1e-13, atol=1e-13)
         y = sol.y[:, -1]
@@ -103,6 +103,32 @@ def test_steps_between_kinks_keep_the_order(adjoint, t0, t1):
     assert errors[1] < 1e-7 and errors[0] / errors[1] > 4**3.5
     # Four, 14, 19 and seven steps.
     assert sols[0].stats["num_steps"] == 44
+
+
+@pytest.mark.parametrize("t0, t1", [(0.0, 3.0), (3.0, 0.0)])
+def test_values_between_kinks_that_a_force_finds_by_rounding(t0, t1):
+    """To this force the time before a knot may be the knot."""
+    spacing, table = 0.1, np.random.default_rng(0).normal(size=31)
+
+    def push(t):
+        left = jnp.clip(jnp.floor(t / spacing), 0, len(table) - 2)
+        first, second = (jnp.asarray(table)[left.astype(int) + k] for k in (0, 1))
+        return first + (t / spacing - left) * (second - first)
+
+    potential = lambda t, q, args: cosine(t, q, None) - push(t) * jnp.sum(q)
+    knots, ts = spacing * np.arange(len(table)), np.linspace(t0, t1, 48)
+    sol = dfx.diffeqsolve(
+        *(system_of(potential), RKN6, t0, t1, np.sign(t1 - t0) * spacing / 4, Y0),
+        stepsize_controller=dps.StepsBetween(knots),
+        adjoint=dps.FixedStepAdjoint(),
+        saveat=dfx.SaveAt(ts=jnp.asarray(ts)),
+    )
+    assert sol.stats["interpolated"] > 40
+    exact = [np.concatenate(Y0)]
+    for first, last in itertools.pairwise(ts):
+        exact.append(by_scipy(first, last, exact[-1], knots, table))
+    values = np.concatenate([np.asarray(y) for y in sol.ys], axis=1)
+    assert np.max(np.abs(values - exact)) < 1e-10
 
 
 def test_a_kink_at_the_start_is_none():

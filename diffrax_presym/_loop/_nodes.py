@@ -19,7 +19,7 @@ from .. import _tree as tree
 from .._numbers import cast_to, State
 from .._scheme._base import Point, Scheme
 from .._system._bound import System
-from ._base import MOST_FRICTION, MOST_STEPS
+from ._base import MOST_FRICTION, MOST_STEPS, rounding_of
 from ._rows import Rows
 from ._steps import Steps
 
@@ -77,7 +77,8 @@ def node(
     """The state at the start of a step, and its derivatives: where they jump, those
     before it (-1) or after it (1)."""
     t, h, moment = steps.time(n), steps.lengths(n), None
-    t = jnp.nextafter(t, t + cast_to(side, t))
+    # A function of time may itself round to the other side.
+    t = t + cast_to(side, t) * rounding_of(steps.t0, t, h)
     if system.external is not None:
         moment = _moment(jnp.where(side < 0, -h, h))
     return derivatives(scheme, system, t, point, moment)

@@ -19,7 +19,7 @@ from .._scheme._engine import backward, is_autonomous, Span
 from .._scheme._failure import explain, unless_too_strong
 from .._scheme._prepare import prepare, prepare_once
 from .._system._bound import System
-from ._base import AbstractSteps, follows, MOST_STEPS, Stop
+from ._base import AbstractSteps, follows, MOST_STEPS, rounding_of, Stop
 
 
 _OTHER_ENDS = (
@@ -342,8 +342,6 @@ class Steps(AbstractSteps):
             length = next - before
             n = jnp.where(ts - before < next - ts, after - 1, after).astype(int)
         start = self.time(n)
-        largest = jnp.maximum(jnp.abs(self.t0), jnp.abs(start))
-        rounding = 4 * float(jnp.finfo(start.dtype).eps) * largest
-        inside = jnp.abs(ts - start) > jnp.minimum(rounding, length / 64)
+        inside = jnp.abs(ts - start) > rounding_of(self.t0, start, length)
         inside &= self.total > 0
         return jnp.where(inside & (ts < start), n - 1, n), inside
