@@ -162,6 +162,26 @@ def test_a_gradient_that_is_lost_is_that_of_one_member_of_a_batch():
     np.testing.assert_allclose(kept, exact[-1], rtol=1e-12)
 
 
+@pytest.mark.parametrize("steps, adjoint", [(400, {"checkpoints": 400}), (100, {})])
+def test_with_as_many_kept_states_as_steps_nothing_is_recomputed(steps, adjoint):
+    """Also where friction is strong in the first steps alone."""
+
+    def loss(q0, adjoint):
+        potential = lambda t, q, args: q @ q / 2
+        friction = dps.LogDamping(20.0)
+        sol = dfx.diffeqsolve(
+            dps.MechanicalSystem(dps.QuadraticKinetic(), potential, friction),
+            *(dps.PresymplecticLeapfrog(), 1.0, 1.0 + steps, 1.0, (q0, 0 * q0)),
+            adjoint=adjoint,
+            max_steps=steps,
+        )
+        return jnp.sum(sol.ys[0])
+
+    slope = jax.grad(loss)(jnp.ones(2), dps.FixedStepAdjoint(**adjoint))
+    exact = jax.grad(loss)(jnp.ones(2), dfx.RecursiveCheckpointAdjoint())
+    np.testing.assert_allclose(slope, exact, rtol=1e-10)
+
+
 def test_a_gradient_that_is_lost_is_an_error_or_not_a_number():
     slope = lambda adjoint, **options: jax.grad(
         lambda gamma: _damped(gamma, adjoint, **options)

@@ -29,7 +29,7 @@ from ._variable import VariableSteps
 
 
 # Of the states that are kept by default.
-_MOST_KEPT, _FEWEST_KEPT, _MOST_BYTES = 128, 16, 2**24
+_MOST_KEPT, _FEWEST_KEPT, _MOST_BYTES, _APART = 128, 16, 2**24, 16
 
 
 class FixedStepAdjoint(dfx.AbstractAdjoint):
@@ -177,15 +177,15 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
                 f"A step of `{type(solver).__name__}` has no known inverse. Write "
                 "`FixedStepAdjoint()`, which takes its gradient by checkpoints."
             )
-        number = self.checkpoints
+        number, apart = self.checkpoints, 1
         if scheme.is_invertible and self.gradient != "checkpoints":
             raises = self.throw if self.throw is not None or throw else False
             if number is None:
                 # As large memory is slow to get, also where few of them are used.
                 arrays = map(jnp.asarray, jtu.tree_leaves(start))
                 room = _MOST_BYTES // sum(max(x.nbytes, 1) for x in arrays)
-                number = min(max(room, _FEWEST_KEPT), _MOST_KEPT)
-            return Reversal(number, self.tol, scheme.inverse_error, raises)
+                number, apart = min(max(room, _FEWEST_KEPT), _MOST_KEPT), _APART
+            return Reversal(number, apart, self.tol, scheme.inverse_error, raises)
         return Checkpoints(max_steps, number)
 
 

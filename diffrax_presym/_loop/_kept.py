@@ -17,8 +17,6 @@ from ._tracks import AbstractTrack, stops_due, Track
 from ._variable import Kept
 
 
-# The least number of steps between two kept states, of a gradient by reversal.
-_APART = 16
 _NOT_RECOMPUTED = (
     "`FixedStepAdjoint` recomputed the states of this solve with an error beyond its "
     "`tol`: damping or instability amplifies rounding backwards in time. Keep more "
@@ -29,9 +27,11 @@ _NOT_RECOMPUTED = (
 
 
 class Reversal(eqx.Module):
-    """By running the scheme backwards between at most so many kept states."""
+    """By running the scheme backwards between at most so many kept states; so many
+    steps apart, if not all are kept and there is no friction."""
 
     most: int = eqx.field(static=True)
+    apart: int = eqx.field(static=True)
     tol: float | None
     inverse_error: float = eqx.field(static=True)  # of the scheme
     # `None`: an error, but NaN for the members of a batch.
@@ -47,7 +47,8 @@ class Reversal(eqx.Module):
         """The steps whose starting states are kept, in order; those that are not are
         after the last step."""
         most, last = self.most + 1, jnp.asarray(problem.last)
-        parts = jnp.asarray(-(-last // _APART))
+        # All, if there is room: then no step is inverted.
+        parts = jnp.where(last <= most, last, -(-last // self.apart))
         if problem.growth is not None:
             # Each part may amplify rounding up to the limit.
             allowed, eps = self.limit(problem.start[0])
