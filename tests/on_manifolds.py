@@ -179,6 +179,20 @@ CASES = {
         ),
         *((Q, L), top_field(0.0 * DAMPERS, lambda R, w: -(1 + R[2, 2]) * w)),
     ),
+    "top, matrix and place": (
+        dps.ManifoldSystem(
+            *(dps.Attitude(INERTIA), top_potential),
+            [dps.ViscousDamping(DAMPERS), dps.ViscousDamping(tilt)],
+        ),
+        *((Q, L), top_field(DAMPERS / INERTIA, lambda R, w: -(1 + R[2, 2]) * w)),
+    ),
+    "top, rates of time": (
+        dps.ManifoldSystem(
+            *(dps.Attitude(INERTIA), top_potential),
+            dps.LogDamping(np.arange(3.0), 1.0),
+        ),
+        *((Q, L), top_field(lambda t: np.diag(np.arange(3.0)) / (1 + t))),
+    ),
     "top, drag": (
         dps.ManifoldSystem(dps.Attitude(INERTIA), top_potential, dps.Drag(0.4)),
         *((Q, L), top_field(0.0 * DAMPERS, lambda R, w: -0.4 * np.linalg.norm(w) * w)),

@@ -54,7 +54,8 @@ class ViscousDamping(AbstractFriction):
     viscous drag, magnetic fields, Coriolis forces.
 
     For friction at a rate, in units of one over time, write `ConstantDamping`. For
-    `MechanicalSystem` and `LagrangianSystem`. In the first, with `QuadraticKinetic`,
+    `MechanicalSystem`, `LagrangianSystem`, and bodies that move freely in a
+    `ManifoldSystem`. In the first, with `QuadraticKinetic`,
     the flow of drift and friction is exact, by `exp(-h C M^-1)` and its integral, so
     that no scheme loses its order by it. A symmetric positive matrix `C` damps; an
     antisymmetric one does no work, and the energy is kept: the force `e v × B` on a

@@ -19,10 +19,11 @@ from ._variable import Kept
 
 _NOT_RECOMPUTED = (
     "`FixedStepAdjoint` recomputed the states of this solve with an error beyond its "
-    "`tol`: damping or instability amplifies rounding backwards in time. Keep more "
-    "states, `FixedStepAdjoint(checkpoints=...)`: if there are as many as steps, "
-    'nothing is recomputed. Or write `FixedStepAdjoint("checkpoints")`. With '
-    "`throw=False`, and for members of a batch, the gradient is NaN instead."
+    "`tol`: damping or instability amplifies rounding backwards in time, or steps are "
+    "too long to be undone. Keep more states, `FixedStepAdjoint(checkpoints=...)`: if "
+    "there are as many as steps, nothing is recomputed. Or write "
+    '`FixedStepAdjoint("checkpoints")`. With `throw=False`, and for members of a '
+    "batch, the gradient is NaN instead."
 )
 
 

@@ -110,7 +110,7 @@ class ConstrainedSplit(AbstractSplit):
 
     def kick(self, system, t, h, y, force, order) -> State:
         if self.base.kick_by == "force":
-            return self.base.kick(_free(system), t, h, y, force, order)
+            return self.base.kick(_free(system), t, h, y, force, _ORDER)
         stage = lambda y, h: self._kick_stage(system, t, h, y, force)
         return over_stages(stage, y, lengths(order, h))
 

@@ -43,6 +43,11 @@ class AbstractForceSplit(AbstractSplit):
     def place_force(self, system: "System", t: Time, y: State) -> PyTree:
         """The force that does not depend on the velocity."""
 
+    def in_kicks(self, system: "System", order: int) -> bool:
+        """Whether friction that depends on time alone is part of kicks of an order, and
+        not of drifts. By default it is not."""
+        return False
+
     @property
     def failure(self):
         return FORCE_NOT_SOLVED if self.kick_by == "momentum" else NONFINITE
@@ -57,7 +62,7 @@ class AbstractForceSplit(AbstractSplit):
         return force, forms, [drag.at(*at) for drag in parts.drags]
 
     def kick(self, system, t, h, y, force, order) -> State:
-        if self.kick_by == "force":
+        if self.kick_by == "force" and not self.in_kicks(system, order):
             return super().kick(system, t, h, y, force, order)
         q, p = tree.values(y)
         change = self.change(system, t, h, q, p, force, order, once=True)
@@ -76,11 +81,17 @@ class AbstractForceSplit(AbstractSplit):
     ) -> Callable[[PyTree], PyTree]:
         """The change of momenta such as `p` by a kick at a place, as their function. If
         that is not applied `once`, what takes longer to prepare pays."""
-        if self.kick_by == "friction":
-            return _by_friction(system, t, h, p, force, order, once)
+        friction = system.friction if self.in_kicks(system, order) else None
+        if self.kick_by != "momentum":
+            force = force if self.kick_by == "friction" else (force, [], [])
+            more = () if friction is None else system.parts.linear
+            return _by_friction(system, t, h, p, force, more, order, once)
         term, args = system.term, system.args
         state = lambda p: (t, q, p, term.velocity(t, q, p, args), args)
-        total = lambda p: term.add_forces(force, term.external, *state(p))
+
+        def total(p: PyTree) -> PyTree:
+            net = force if friction is None else friction.net_force(t, force, p)
+            return term.add_forces(net, term.external, *state(p))
 
         def change(p: PyTree) -> PyTree:
             dp, found = force_flow(total, h, p, order)
@@ -89,7 +100,9 @@ class AbstractForceSplit(AbstractSplit):
         return change
 
 
-def _by_friction(system, t, h, p, force, order, once) -> Callable[[PyTree], PyTree]:
+def _by_friction(
+    system, t, h, p, force, more, order, once
+) -> Callable[[PyTree], PyTree]:
     force, forms, drags = force
     parts, mechanics = system.parts, system.term.mechanics
     pairs = zip(parts.local, forms, strict=True)
@@ -97,7 +110,7 @@ def _by_friction(system, t, h, p, force, order, once) -> Callable[[PyTree], PyTr
         LinearPart(LinearScale(), x, part.per_velocity, may_couple=True)
         for part, x in pairs
     ]
-    friction = fit_friction(linear, mechanics, p)
+    friction = fit_friction([*linear, *more], mechanics, p)
 
     def prepare(h: Time) -> PyTree:
         if friction is None:

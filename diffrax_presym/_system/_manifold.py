@@ -18,7 +18,6 @@ from .._friction._damping import as_laws
 from .._friction._linear import LinearFriction
 from .._numbers import as_time, cast_to, Scalar, State, Time
 from ._base import AbstractSystem, P, Q
-from ._bound import System
 from ._force_split import AbstractForceSplit
 from ._manifolds import AbstractManifold, unitless
 from ._potential import AbstractPotential, as_potential, ForceField
@@ -33,9 +32,10 @@ class ManifoldSystem(AbstractSystem):
 
     Positions are in ambient coordinates. Drifts are free motions along geodesics, which
     friction at a rate shortens; other linear friction that depends on time alone is
-    composed with them. Kicks are tangential, and those by other friction or a `force`
-    of the velocity solve an equation for the momentum, symmetric and to the order of
-    the scheme. `Strang`, `BlanesMoan4`, `BlanesMoan6` and compositions keep their
+    composed with them, or if constant part of the kicks of `BlanesMoan4` and
+    `BlanesMoan6`. Kicks are tangential, and those by other friction or a `force` of the
+    velocity solve an equation for the momentum, symmetric and to the order of the
+    scheme. `Strang`, `BlanesMoan4`, `BlanesMoan6` and compositions keep their
     order, and positions stay on the manifold to rounding. Start from
     `system.project(t0, y0)`. In Diffrax's loop save values between steps by
     `SaveAt(ts=ts, fn=system.project)`.
@@ -243,11 +243,19 @@ class ManifoldSplit(AbstractForceSplit):
     def quadrature(self, system, order) -> int:
         return 0 if system.friction is None or system.friction.is_known else order
 
+    def in_kicks(self, system, order) -> bool:
+        # Of order 2 it is composed with drifts, once; of higher orders several times.
+        friction = system.friction
+        if friction is None or friction.is_one_rate:
+            return False
+        return order > 2 and friction.is_autonomous
+
     def prepare(self, system, t, h, order) -> PyTree:
-        friction, shortens = system.friction, _only_shortens(system)
-        h = jnp.reshape(h, 1) if shortens else lengths(order, h)
-        if friction is None:
-            return h, None
+        friction, once = system.friction, jnp.reshape(h, 1)
+        if friction is None or self.in_kicks(system, order):
+            return once, None
+        shortens = friction.is_one_rate
+        h = once if shortens else lengths(order, h)
         starts, prepare = (
             t + jnp.cumsum(h) - h,
             lambda t, h: friction.prepare(t, h, order),
@@ -264,10 +272,10 @@ class ManifoldSplit(AbstractForceSplit):
 
     def _stage(self, system, h, data, q, p) -> State:
         term, friction = system.term, system.friction
-        if friction is None or not _only_shortens(system):
+        if data is None or not friction.is_one_rate:
             flow = lambda m, q, p: m.flow(q, p, cast_to(h, p))
             move = lambda q, p: term.pair(term.map(flow, q, p))
-            if friction is None:
+            if data is None:
                 return move(q, p)
             q, p = move(q, tree.add(p, friction.decay(data[0], p)))
             return q, tree.add(p, friction.decay(data[1], p))
@@ -278,8 +286,3 @@ class ManifoldSplit(AbstractForceSplit):
 
     def place_force(self, system, t, y) -> PyTree:
         return system.term.kick(t, *tree.values(y), system.args)
-
-
-def _only_shortens(system: System) -> bool:
-    """Whether friction changes how far a motion goes, and not where."""
-    return system.friction is None or system.friction.is_one_rate
