@@ -294,7 +294,7 @@ MUTANTS = [
     Mutant("a given number of kept states is not used", "_loop/_adjoint.py",
         "number, apart = self.checkpoints, 1",
         "number, apart = self.checkpoints, _APART",
-        tests="test_kept_states.py", only="as_many_kept"),
+        tests="test_kept_states.py", only="as_wanted"),
     Mutant("derivatives beside a kink, one rounding before it", "_loop/_nodes.py",
         "t = t + cast_to(side, t) * rounding_of(steps.t0, t, h)",
         "t = jnp.nextafter(t, t + cast_to(side, t))",

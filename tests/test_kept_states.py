@@ -162,9 +162,12 @@ def test_a_gradient_that_is_lost_is_that_of_one_member_of_a_batch():
     np.testing.assert_allclose(kept, exact[-1], rtol=1e-12)
 
 
-@pytest.mark.parametrize("steps, adjoint", [(400, {"checkpoints": 400}), (100, {})])
-def test_with_as_many_kept_states_as_steps_nothing_is_recomputed(steps, adjoint):
-    """Also where friction is strong in the first steps alone."""
+KEPT = [(400, {"checkpoints": 400}), (400, {"checkpoints": 200}), (100, {})]
+
+
+@pytest.mark.parametrize("steps, adjoint", KEPT)
+def test_as_many_kept_states_as_wanted(steps, adjoint):
+    """Friction is strong in the first steps alone, of which few can be recomputed."""
 
     def loss(q0, adjoint):
         potential = lambda t, q, args: q @ q / 2
