@@ -54,13 +54,12 @@ class ViscousDamping(AbstractFriction):
     viscous drag, magnetic fields, Coriolis forces.
 
     For friction at a rate, in units of one over time, write `ConstantDamping`. For
-    `MechanicalSystem`, `LagrangianSystem`, and bodies that move freely in a
-    `ManifoldSystem`. In the first, with `QuadraticKinetic`,
-    the flow of drift and friction is exact, by `exp(-h C M^-1)` and its integral, so
-    that no scheme loses its order by it. A symmetric positive matrix `C` damps; an
-    antisymmetric one does no work, and the energy is kept: the force `e v × B` on a
-    charge `e` in a uniform magnetic field `B`, and the Coriolis force `-2 m Ω × v` in a
-    frame that rotates with `Ω`.
+    `MechanicalSystem`, `LagrangianSystem`, and bodies of a `ManifoldSystem`. In the
+    first, with `QuadraticKinetic`, the flow of drift and friction is exact, by
+    `exp(-h C M^-1)` and its integral, so that no scheme loses its order by it. A
+    symmetric positive matrix `C` damps; an antisymmetric one does no work, and the
+    energy is kept: the force `e v × B` on a charge `e` in a uniform magnetic field `B`,
+    and the Coriolis force `-2 m Ω × v` in a frame that rotates with `Ω`.
 
     With numbers or arrays the cost is that of `ConstantDamping`. With matrices and
     equal steps, in the loop of `FixedStepAdjoint`, exponentials for all stages are

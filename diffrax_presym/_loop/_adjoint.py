@@ -28,7 +28,7 @@ from ._steps import Steps, StepsBetween
 from ._variable import VariableSteps
 
 
-# Of the states that are kept by default.
+# Of the states kept by default; the last, the steps between them if not all are kept.
 _MOST_KEPT, _FEWEST_KEPT, _MOST_BYTES, _APART = 128, 16, 2**24, 16
 
 

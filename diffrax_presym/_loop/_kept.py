@@ -28,11 +28,10 @@ _NOT_RECOMPUTED = (
 
 
 class Reversal(eqx.Module):
-    """By running the scheme backwards between at most so many kept states; so many
-    steps apart, if not all are kept and there is no friction."""
+    """By running the scheme backwards between kept states."""
 
-    most: int = eqx.field(static=True)
-    apart: int = eqx.field(static=True)
+    most: int = eqx.field(static=True)  # of these
+    apart: int = eqx.field(static=True)  # least steps between, if not all are kept
     tol: float | None
     inverse_error: float = eqx.field(static=True)  # of the scheme
     # `None`: an error, but NaN for the members of a batch.
@@ -48,7 +47,7 @@ class Reversal(eqx.Module):
         """The steps whose starting states are kept, in order; those that are not are
         after the last step."""
         most, last = self.most + 1, jnp.asarray(problem.last)
-        # All, if there is room: then no step is inverted.
+        # If all are kept, no step is inverted.
         parts = jnp.where(last <= most, last, -(-last // self.apart))
         if problem.growth is not None:
             # Each part may amplify rounding up to the limit.

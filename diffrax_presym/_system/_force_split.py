@@ -84,8 +84,8 @@ class AbstractForceSplit(AbstractSplit):
         friction = system.friction if self.in_kicks(system, order) else None
         if self.kick_by != "momentum":
             force = force if self.kick_by == "friction" else (force, [], [])
-            more = () if friction is None else system.parts.linear
-            return _by_friction(system, t, h, p, force, more, order, once)
+            linear = () if friction is None else system.parts.linear
+            return _by_friction(system, t, h, p, force, linear, order, once)
         term, args = system.term, system.args
         state = lambda p: (t, q, p, term.velocity(t, q, p, args), args)
 
@@ -101,16 +101,16 @@ class AbstractForceSplit(AbstractSplit):
 
 
 def _by_friction(
-    system, t, h, p, force, more, order, once
+    system, t, h, p, force, linear, order, once
 ) -> Callable[[PyTree], PyTree]:
     force, forms, drags = force
     parts, mechanics = system.parts, system.term.mechanics
     pairs = zip(parts.local, forms, strict=True)
-    linear = [
+    local = [
         LinearPart(LinearScale(), x, part.per_velocity, may_couple=True)
         for part, x in pairs
     ]
-    friction = fit_friction([*linear, *more], mechanics, p)
+    friction = fit_friction([*local, *linear], mechanics, p)
 
     def prepare(h: Time) -> PyTree:
         if friction is None:

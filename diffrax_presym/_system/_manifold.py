@@ -1,6 +1,7 @@
 """Systems on manifolds whose free motion is known."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
@@ -244,7 +245,7 @@ class ManifoldSplit(AbstractForceSplit):
         return 0 if system.friction is None or system.friction.is_known else order
 
     def in_kicks(self, system, order) -> bool:
-        # Of order 2 it is composed with drifts, once; of higher orders several times.
+        # Composed with a drift to a higher order it would be several drifts.
         friction = system.friction
         if friction is None or friction.is_one_rate:
             return False
@@ -256,10 +257,7 @@ class ManifoldSplit(AbstractForceSplit):
             return once, None
         shortens = friction.is_one_rate
         h = once if shortens else lengths(order, h)
-        starts, prepare = (
-            t + jnp.cumsum(h) - h,
-            lambda t, h: friction.prepare(t, h, order),
-        )
+        starts, prepare = t + jnp.cumsum(h) - h, partial(friction.prepare, order=order)
         halves = lambda t, h: (prepare(t, h / 2), prepare(t + h / 2, h / 2))
         return h, jax.vmap(prepare if shortens else halves)(starts, h)
 
