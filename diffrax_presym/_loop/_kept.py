@@ -22,8 +22,8 @@ _NOT_RECOMPUTED = (
     "`tol`: damping or instability amplifies rounding backwards in time, or steps are "
     "too long to be undone. Keep more states, `FixedStepAdjoint(checkpoints=...)`: if "
     "there are as many as steps, nothing is recomputed. Or write "
-    '`FixedStepAdjoint("checkpoints")`. With `throw=False`, and for members of a '
-    "batch, the gradient is NaN instead."
+    '`FixedStepAdjoint("checkpoints")`, which needs `max_steps`. With `throw=False`, '
+    "and for members of a batch, the gradient is NaN instead."
 )
 
 
