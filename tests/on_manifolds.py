@@ -246,6 +246,11 @@ CASES = {
         orthonormal(lambda t: 0.2, lambda q: SQUARE, (3, 3)),
     ),
 }
+# Those whose kicks are by a force of the place alone.
+DRIFTS = [
+    *("top, one rate", "top, rate of time", "floating body", "rotations"),
+    *("sphere", "sphere, rate of time", "Stiefel"),
+]
 
 
 def start(case):

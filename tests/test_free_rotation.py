@@ -1,5 +1,7 @@
 """The free rotation of a rigid body, beside Euler's equations in NumPy."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -169,6 +171,26 @@ def test_steps_in_which_a_body_turns_many_times():
             np.testing.assert_allclose(flow(inertia, found, -s), state(p), atol=1e-6)
             passed += 1
     assert passed > 30 and np.max(errors) < 1e-6 and np.median(errors) < 1e-11
+
+
+def test_derivatives_of_long_steps():
+    """By the moments as by the momentum, beside those of eight steps."""
+    rng = np.random.default_rng(0)
+    sizes, omega = rng.uniform(0.1, 1.0, (300, 3)), rng.standard_normal((300, 3))
+    inertia = np.sum(sizes, axis=1, keepdims=True) - sizes
+    omega *= 2.5 / np.linalg.norm(omega, axis=1, keepdims=True)
+
+    def after(steps, inertia, p):
+        step = lambda y, _: (flow(inertia, y, 1.0 / steps), None)
+        return jax.lax.scan(step, state(p), length=steps)[0]
+
+    both = partial(jax.jacfwd, argnums=(1, 2))
+    one, eight = (
+        jax.jit(jax.vmap(partial(both(after), steps)))(inertia, inertia * omega)
+        for steps in (1, 8)
+    )
+    for found, exact in zip(one, eight, strict=True):
+        assert jnp.max(jnp.abs(found - exact)) < 3e-12 * jnp.max(jnp.abs(exact))
 
 
 @pytest.mark.parametrize("s", [10.0, 40.0])

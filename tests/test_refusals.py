@@ -12,7 +12,10 @@ import jax
 import jax.numpy as jnp
 import pytest
 from catalogue import build, claim, offered, Problem, Refused
+from on_manifolds import CASES, DRIFTS, start
 from rows import SAMPLE
+
+import diffrax_presym as dps
 
 
 @cache
@@ -42,6 +45,14 @@ def check_refusal(system, friction, scheme):
         problem = Problem(built, solver, 0.5, 1.0, dfx.RecursiveCheckpointAdjoint())
         jax.eval_shape(lambda: problem.solve(0.1, y0, dfx.SaveAt(t1=True)).ys)
     assert re.search("(?i)write|use |pass ", str(error.value)), error.value
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if case not in DRIFTS])
+def test_nystrom_schemes_on_manifolds_refuse_friction_in_kicks(case):
+    message = r"`TunedRKN6` keeps its order.*one rate.*`BlanesMoan6\(\)`"
+    problem = CASES[case][0], dps.TunedRKN6(), 0.0, 1.0, 0.1, start(case)
+    with pytest.raises(ValueError, match=message):
+        dfx.diffeqsolve(*problem)
 
 
 def check_composition(scheme, wrapper):

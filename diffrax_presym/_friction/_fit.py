@@ -158,12 +158,20 @@ def one_rate(parts: Parts) -> AbstractDamping | None:
     return SumOfDampings(terms) if terms else None
 
 
-def has_one_rate(parts: Parts) -> bool:
-    def is_number(part: LinearPart) -> bool:
+def has_rates(parts: Parts) -> bool:
+    """Whether friction is one rate for each array of momenta, and nothing else."""
+
+    def is_rate(part: LinearPart) -> bool:
         if part.per_velocity or is_operator(part.form):
             return False
-        shape = jtu.tree_map(jnp.shape, part.form)
-        return shape == () and part.log_scale.shape == ()
+        shapes = [*map(jnp.shape, jtu.tree_leaves(part.form)), part.log_scale.shape]
+        return all(shape == () for shape in shapes)
 
     linear, *other = parts
-    return not any(other) and all(map(is_number, linear))
+    return not any(other) and all(map(is_rate, linear))
+
+
+def has_one_rate(parts: Parts) -> bool:
+    """Whether this is the same rate for all arrays."""
+    is_number = lambda part: jtu.treedef_is_leaf(jtu.tree_structure(part.form))
+    return has_rates(parts) and all(map(is_number, parts.linear))

@@ -12,6 +12,13 @@ def find_split(
     split, name = system.split(kind), type(solver).__name__
     if split is not None:
         return split
+    if kind == "nystrom" and system.term.is_constrained:
+        raise ValueError(
+            f"`{name}` keeps its order on a manifold only without constraints, for "
+            "friction at one rate for each array of momenta, and without a `force=f` "
+            "of the velocity. Otherwise use `Strang()`, `BlanesMoan4()` or "
+            "`BlanesMoan6()`, or compositions such as `SofroniouSpaletta(6, Strang())`."
+        )
     refuse_constrained(solver, system)
     if kind == "shared":
         raise ValueError(

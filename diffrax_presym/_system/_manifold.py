@@ -16,6 +16,7 @@ from .._compositions import lengths, over_stages
 from .._forms import divide, multiply
 from .._friction._base import AbstractFriction, MASS, Mechanics
 from .._friction._damping import as_laws
+from .._friction._fit import has_rates
 from .._friction._linear import LinearFriction
 from .._numbers import as_time, cast_to, Scalar, State, Time
 from ._base import AbstractSystem, P, Q
@@ -36,8 +37,10 @@ class ManifoldSystem(AbstractSystem):
     composed with them, or if constant part of the kicks of `BlanesMoan4` and
     `BlanesMoan6`. Kicks are tangential, and those by other friction or a `force` of the
     velocity solve an equation for the momentum, symmetric and to the order of the
-    scheme. `Strang`, `BlanesMoan4`, `BlanesMoan6` and compositions keep their
-    order, and positions stay on the manifold to rounding. Start from
+    scheme. `Strang`, `BlanesMoan4`, `BlanesMoan6` and compositions keep their order; so
+    does `TunedRKN6`, which is faster, and other Runge--Kutta--Nyström schemes, if
+    friction is at one rate for each array of momenta and there is no `force`. Positions
+    stay on the manifold to rounding. Start from
     `system.project(t0, y0)`. In Diffrax's loop save values between steps by
     `SaveAt(ts=ts, fn=system.project)`.
 
@@ -125,7 +128,10 @@ class ManifoldSystem(AbstractSystem):
             kick_by = "friction" if self.is_free else "momentum"
         if self.external is not None or parts.drags or parts.forces:
             kick_by = "momentum"
-        return (ManifoldSplit(kick_by),)
+        # Other friction would be part of the kicks, or make a drift several.
+        is_drift = kick_by == "force" and has_rates(parts)
+        nystrom = {"nystrom"} if is_drift else set()
+        return (ManifoldSplit(frozenset({"any"} | nystrom), kick_by),)
 
     def check_state(self, y: PyTree) -> None:
         wanted = jtu.tree_structure(self.manifold, is_leaf=_is_manifold)
@@ -238,8 +244,8 @@ class ManifoldSystem(AbstractSystem):
 class ManifoldSplit(AbstractForceSplit):
     """The free motion, with friction, and tangential kicks."""
 
+    kinds: frozenset[str] = eqx.field(static=True)
     kick_by: str = eqx.field(static=True)
-    kinds: ClassVar[frozenset[str]] = frozenset({"any"})
 
     def quadrature(self, system, order) -> int:
         return 0 if system.friction is None or system.friction.is_known else order

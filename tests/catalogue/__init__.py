@@ -17,7 +17,7 @@ import numpy as np
 import scipy.integrate
 from jax.flatten_util import ravel_pytree
 
-from ._system import System
+from ._system import ANY, System
 from .friction import FRICTION, Friction, LENGTH
 from .schemes import each, PATHS, pick, Scheme, SCHEMES, STATES, Wrapper, WRAPPERS
 from .systems import SYSTEMS
@@ -72,7 +72,8 @@ def offered(system: System, friction: Friction) -> frozenset[str] | Refused:
     if system.takes == "tangential":
         # In drifts one rate, in kicks any friction along the manifold.
         linear = kind in ("entries", "matrix") or friction.name.startswith("[matrix")
-        return frozenset() if linear else system.offers
+        offers = system.offers if kind == "one rate" else ANY
+        return frozenset() if linear else offers
     if system.takes == "joints":
         return Refused("not of joints") if friction.needs == "bodies" else frozenset()
     if friction.needs == "mass" and system.takes == "velocities":
@@ -85,8 +86,9 @@ def offered(system: System, friction: Friction) -> frozenset[str] | Refused:
         return frozenset()  # without a closed form, it is a force
     if kind == "force" and system.takes == "rates":
         return frozenset()
-    if kind in ("force", "place", "drag"):
-        return system.offers & {"any"}
+    in_kicks = kind in ("force", "place", "drag")
+    if in_kicks or (system.constrained and kind != "one rate"):
+        return system.offers & ANY
     constant = friction.constant and kind == "one rate"
     return system.offers - (frozenset() if constant else {"shared", "linear"})
 

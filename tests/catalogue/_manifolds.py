@@ -6,7 +6,7 @@ import scipy.spatial
 
 import diffrax_presym as dps
 
-from ._system import ANY, constrained, manifold, mechanical, System
+from ._system import ANY, constrained, manifold, mechanical, NYSTROM, System
 
 
 def _reaction(slopes, inverse, change, force):
@@ -123,7 +123,7 @@ MANIFOLDS = [
     System(
         *("rigid body", manifold(dps.Attitude(_INERTIA), _top)),
         *(_top_force, (_TURNED, _SPIN), np.diag(_INERTIA), _top_velocity),
-        offers=ANY,
+        offers=NYSTROM,
         bodies=True,
         constrained=True,
     ),
@@ -139,7 +139,7 @@ MANIFOLDS = [
     System(
         *("sphere", manifold(dps.Sphere(), _form), _form_force, (_VECTOR, _SPIN), None),
         velocity=lambda t, q, p, eta: p,
-        offers=ANY,
+        offers=NYSTROM,
         takes="tangential",
         bodies=True,
         constrained=True,

@@ -17,6 +17,7 @@ ALL = SPLIT | {"nystrom"}
 RATE = ALL | {"shared"}
 LINEAR = RATE | {"linear"}
 ANY = frozenset({"any"})
+NYSTROM = ANY | {"nystrom"}
 TWO = np.array([1.0, -0.4]), np.array([0.3, 0.5])
 
 
