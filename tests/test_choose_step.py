@@ -34,7 +34,7 @@ CASES = {
     "grid": ((PENDULUM, dps.Strang(), *LONG), {"ts": REGULAR}, 1e-4, 1e-4, 64),
     "between": ((PENDULUM, RKN6, *LONG), {"ts": REGULAR}, 1e-9, 1e-9, 3),
     "irregular": ((PENDULUM, RKN6, *LONG), {"ts": IRREGULAR}, 1e-7, 1e-9, 3),
-    "backwards": ((PENDULUM, S6, *BACK), {"ts": REGULAR[::-1]}, 1e-4, 1e-6, 3),
+    "backwards": ((PENDULUM, S6, *BACK), {"ts": REGULAR[::-1]}, 1e-6, 1e-8, 3),
     "Diffrax": ((PENDULUM, dfx.Tsit5(), *LONG), DIRECT, 1e-6, 1e-6, 3),
 }
 
@@ -102,11 +102,11 @@ def test_grids(ts, number):
     [np.linspace(0, 20, 501), np.array([2.0, 4.0, 14.0]), np.arange(0.25, 20, 0.5)],
 )
 def test_no_other_step_tried_is_cheaper(ts, solver, tolerance):
-    # A saved time inside of a step takes a step more, of schemes up to order two.
+    # A saved time inside of a step takes a step more, or a third if it is interpolated.
     def cost(n):
         ends = ts * n / 20.0
         inside = np.sum(np.abs(ends - np.round(ends)) > 1e-9)
-        return n + (inside if solver.order(None) == 2 else 0)
+        return n + inside * (1 if solver.order(None) == 2 else 1 / 3)
 
     solve = solve_of(PENDULUM, solver, *LONG, ts=jnp.asarray(ts))
     step = dps.choose_step(solve, 0.0, 20.0, rtol=tolerance, atol=tolerance)

@@ -17,6 +17,32 @@ import diffrax_presym as dps
 GAUSS = dps.PresymplecticGauss
 
 
+@pytest.mark.parametrize(
+    "rate, solver, tolerance",
+    [(0.0, dps.BlanesMoanRKN4(), 3e-2), (0.5, dps.TunedRKN6(), 1e-2)],
+)
+def test_chosen_steps_end_at_saved_times_if_that_costs_less(rate, solver, tolerance):
+    """Where long steps take shorter ones to saved times and short steps interpolate,
+    and where all interpolate."""
+    layer = jnp.where(jnp.arange(20) < 4, rate, 0.0)
+    springs = lambda t, q, args: 2 * jnp.sum(jnp.diff(q, prepend=0.0, append=0.0) ** 2)
+    chain = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), springs, dps.ConstantDamping(layer)
+    )
+    y0 = jnp.exp(-(jnp.linspace(-10.0, 9.0, 20) ** 2) / 8), jnp.zeros(20)
+
+    @jax.jit
+    def run(dt0):
+        return dfx.diffeqsolve(
+            *(chain, solver, 0.0, 90.0, dt0, y0), max_steps=None,
+            saveat=dfx.SaveAt(ts=jnp.linspace(0.0, 90.0, 101)),
+            adjoint=dps.FixedStepAdjoint(),
+        )  # fmt: skip
+
+    step = dps.choose_step(run, 0.0, 90.0, rtol=tolerance, atol=tolerance)
+    assert step.steps == 100 and step.on_grid and step.error <= 1
+
+
 @pytest.mark.parametrize("rate, interpolated", [(1.8, True), (8.0, False)])
 def test_a_fast_rotation_takes_shorter_steps(rate, interpolated):
     """A magnetic field, of which drifts are exact however much they turn."""

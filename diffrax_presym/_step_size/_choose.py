@@ -104,10 +104,10 @@ def choose_step(
     `StepDensityController`: what `solve` is given is then not a step, but the number of
     steps that it takes falls as that grows. Say where to begin: `first=1.0`.
 
-    The step divides the span. A saved time inside of a step costs a step more, unless
-    `FixedStepAdjoint` interpolates it. So if the saved times are on a grid that divides
-    the span, and steps that end at all of them cost no more, such a step is chosen. The
-    error may then be much smaller than aimed at.
+    The step divides the span. A saved time inside of a step costs a step more, or a
+    third of one if `FixedStepAdjoint` interpolates it. So if the saved times are on a
+    grid that divides the span, and steps that end at all of them cost no more, such a
+    step is chosen. The error may then be much smaller than aimed at.
 
     It needs concrete numbers, so it is called outside of `jax.jit`. It knows only the
     solve that it is given: for other parameters choose another step, and in a batch

@@ -132,7 +132,7 @@ def find_steps(
             if finest.steps != n:  # The steps are not those that divide the span.
                 grid = grid._replace(intervals=None)
             numbers = _numbers(grid.intervals or 1, n)
-        grid = grid and grid._replace(is_free=finest.interpolates)
+        grid = grid and grid.of_solve(finest.interpolates)
         if law is None or last is None:
             law = Law((), finest, finest.order, tolerances)
             continue
@@ -153,10 +153,12 @@ def find_steps(
         report(high)
         converges = len(law.ladder) > 1 and (law.converges or law.agrees)
         if grid and high.error <= 1 and (converges or doubted):
+            interpolates = {x.number: x.interpolates for x in (last, finest)}
 
-            def measure(n: int, law: Law = law) -> Trial:
-                trial = law.trial(law.finest if n == law.finest.number else solve(n))
-                report(trial)
+            def measure(n: int, law: Law = law, known: dict = interpolates) -> Trial:
+                solution = law.finest if n == law.finest.number else solve(n)
+                known[n] = solution.interpolates
+                report(trial := law.trial(solution))
                 return trial
 
             smooth = _is_smooth(law, high, grid, measure)
@@ -168,7 +170,8 @@ def find_steps(
             choice = Choice(high, order, law.claimed, smooth, grid)
             if smooth or doubted:
                 best = _smallest(law, high, grid, measure) if smooth else high
-                more = int(grid.cheaper(np.array([best.number]))[0])
+                own = grid.of_solve(interpolates[best.number])
+                more = int(own.cheaper(np.array([best.number]))[0])
                 if best.number < more and expected(more) <= max_steps:
                     finer = measure(more)
                     best = finer if finer.error <= 1 else best

@@ -24,7 +24,7 @@ class Solution(NamedTuple):
     leaves: list[np.ndarray]  # values, and times
     finite: bool
     order: int | None  # of the scheme, if that is known
-    interpolates: bool = False  # between steps, at no cost
+    interpolates: bool = False  # between steps, at the cost of a third of one
     values: int = 0  # the number of leaves that are values
     missed: bool = False  # whether its steps were far from what their density asks for
 
