@@ -4,6 +4,8 @@
 reference is Jacobi's solution (Landau and Lifshitz, paragraph 37), with the angle of
 precession by quadrature.
 
+`top`: a heavy top with friction, about a fast spin. The reference is SciPy's DOP853.
+
 `rods`: rods that hang by ball joints, with viscous drag on the velocity of each centre
 and on each angular velocity: in MuJoCo its `viscosity`, in reduced coordinates; here
 constraints that join free bodies. The reference is SciPy's DOP853 on the equations in
@@ -44,6 +46,8 @@ SCHEMES = {
     "SofroniouSpaletta(8, Strang)": dps.SofroniouSpaletta(8, STRANG),
     "BlanesMoan6": dps.BlanesMoan6(),
 }
+# Of bodies that nothing joins.
+NYSTROM = {"BlanesMoanRKN6": dps.BlanesMoanRKN6(), "TunedRKN6": dps.TunedRKN6()}
 INTEGRATORS = "Euler", "implicitfast", "RK4"
 OURS, THEIRS, MUJOCO = "diffrax_presym", "Diffrax", "MuJoCo"
 
@@ -53,6 +57,7 @@ def simulation(text, qpos, qvel, t1):
     try:
         mj: Any = importlib.import_module("mujoco")
     except ImportError:
+        print("MuJoCo is not installed.")
         return None
     # Steps that are too long would be warned of, in a file too.
     mj.set_mju_user_warning(lambda message: None)
@@ -77,14 +82,16 @@ def inertial(inertia, below=0.0):
     return f'<inertial pos="0 0 {-below}" mass="1" diaginertia="{moments}"/>'
 
 
-def compare(caption, ours, theirs, simulate, exact, least, quick):
+def compare(
+    caption, ours, theirs, simulate, exact, least, quick, schemes=SCHEMES | NYSTROM
+):
     """Tables of the time to an error: of our schemes and of Diffrax's, functions of the
     scheme and of more options that return a solve, and of MuJoCo."""
     counts = list(map(float, np.ceil(least * 2 ** (np.arange(40) / 2))))
     tolerances = list(10.0 ** -np.arange(3, 14))
     runs = {}
-    for name in list(SCHEMES)[1:2] if quick else SCHEMES:
-        runs[OURS, name] = ours(SCHEMES[name]), counts
+    for name in list(schemes)[1:2] if quick else schemes:
+        runs[OURS, name] = ours(schemes[name]), counts
     runs |= diffrax_runs(theirs, THEIRS, counts, tolerances, quick)
     for name in INTEGRATORS if simulate else ():
         runs[MUJOCO, name] = partial(simulate, name), [10 * x for x in counts]
@@ -92,8 +99,13 @@ def compare(caption, ours, theirs, simulate, exact, least, quick):
     enough = (min(TARGETS), 0.1 if quick else 2.0)
     curves = error_curves(runs, error, 2 if quick else 5, enough)
     print_least(caption, curves, TARGETS, OURS)
-    if not simulate:
-        print("MuJoCo is not installed.")
+
+
+def turns(times, y0, term, solver, **more):
+    """A solve of one body until its end, of which the centre is at rest."""
+    end = lambda x: states(term, solver, times, y0, x, **more)
+    place = jnp.zeros((1, 3))
+    return jax.jit(lambda x: (place, dps.rotation_matrix(end(x)[0])[None]))
 
 
 # A free body.
@@ -142,11 +154,7 @@ def free(options, t1=100.0):
         q, p = y
         return turning(q, p / moments), jnp.cross(p, p / moments)
 
-    def run(term, solver, **more):
-        end = lambda x: states(term, solver, times, y0, x, **more)
-        place = jnp.zeros((1, 3))
-        return jax.jit(lambda x: (place, dps.rotation_matrix(end(x)[0])[None]))
-
+    run = partial(turns, times, y0)
     matrix, p = jacobi(t1)
     q_end, p_end = integrated(rates, y0, t1)
     table = Table(
@@ -165,6 +173,28 @@ def free(options, t1=100.0):
         *(partial(run, system), partial(run, dfx.ODETerm(rates))),
         *(simulation(text, *start, t1), (np.zeros((1, 3)), matrix[None])),
         *(50, options.quick),
+    )
+
+
+def top(options, t1=100.0):
+    moments, weight, rate = jnp.array([1.0, 1.2, 0.4]), 3.0, 0.01
+    height = lambda t, q, args: weight * dps.rotation_matrix(q)[2, 2]
+    law = dps.ConstantDamping(rate)
+    system = dps.ManifoldSystem(dps.Attitude(moments), height, law)
+    tilted = jnp.array([np.cos(0.3), np.sin(0.3), 0.0, 0.0])
+    y0 = tilted, moments * jnp.array([0.1, 0.2, 10.0])
+
+    def rates(t, y, args):
+        q, p = y
+        torque = weight * jnp.cross(dps.rotation_matrix(q)[2], jnp.eye(3)[2])
+        return turning(q, p / moments), jnp.cross(p, p / moments) + torque - rate * p
+
+    run = partial(turns, (0.0, t1), y0)
+    matrix = dps.rotation_matrix(integrated(rates, y0, t1)[0])
+    compare(
+        f"A heavy top with friction to t = {t1}",
+        *(partial(run, system), partial(run, dfx.ODETerm(rates)), None),
+        *((np.zeros((1, 3)), matrix[None]), 200, options.quick),
     )
 
 
@@ -306,12 +336,12 @@ def rods(options, t1=2.0):
     if simulate:
         check(simulate, exact, quick)
     caption = f"{n} rods with ball joints and drag to t = {t1}"
-    compare(caption, ours, theirs, simulate, exact, 20, quick)
+    compare(caption, ours, theirs, simulate, exact, 20, quick, SCHEMES)
 
 
 def main():
     parser = command_line(__doc__)
-    parts = {"free": free, "rods": rods}
+    parts = {"free": free, "top": top, "rods": rods}
     parser.add_argument("parts", nargs="*", help=f"of {', '.join(parts)}")
     parser.add_argument("--rods", type=int, default=3, help="how many")
     options = parser.parse_args()
