@@ -311,6 +311,12 @@ MUTANTS = [
     Mutant("an infinite span takes no step", "_loop/_steps.py",
         "jnp.where(finite, numbers, 0).astype(int), most)",
         "jnp.where(finite, numbers, 0).astype(int), 0)", tests="test_steps.py"),
+    Mutant("a chosen step is one of a solve that interpolates",
+        "_step_size/_convergence.py", "own = grid.of_solve(interpolates[best.number])",
+        "own = grid", tests="test_shorter_steps.py", only="chosen"),
+    Mutant("few nodes for derivatives by the moments of inertia",
+        "_system/_free_rotation.py", "leggauss(14)", "leggauss(7)",
+        tests="test_free_rotation.py", only="long_steps"),
     # Forces.
     Mutant("a wrong sign in a force term", "_system/_lagrangian.py",
         "return kinetic - self._potential(t, q, args)",
@@ -332,4 +338,7 @@ MUTANTS = [
         'KineticSplit(frozenset({"any"}), "friction")',
         'KineticSplit(frozenset({"any", "nystrom"}), "friction")',
         tests="test_refusals.py"),
+    Mutant("Nystrom splittings of bodies take friction by axis",
+        "_system/_manifold.py", 'kick_by == "force" and has_rates(parts)',
+        'kick_by == "force"', tests="test_refusals.py", only="on_manifolds"),
 ]  # fmt: skip

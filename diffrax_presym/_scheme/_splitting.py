@@ -274,8 +274,8 @@ class TunedRKN6(AbstractSplitting):
     interpolation for dense/ts output, in Diffrax's own loop at the cost of three more
     steps.
 
-    For quadratic kinetic energies or quadratic potentials: the first choice, with
-    `choose_step`. For oscillations about equilibria its error is much smaller than that
+    For quadratic kinetic energies, also of rigid bodies and on manifolds, or quadratic
+    potentials: the first choice, with `choose_step`. For oscillations about equilibria its error is much smaller than that
     of `BlanesMoanRKN6` at equal cost.
 
     Source: this package, `benchmarks/tuning.py`. The coefficients satisfy the
