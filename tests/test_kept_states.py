@@ -57,6 +57,7 @@ def test_kept_states_make_up_for_what_damping_forgets(dtype, eta, tolerance):
     assert_close(found, damping_gradient(FIXED_STEP, inputs(jnp.float64)), tolerance)
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("adjoint", [REVERSIBLE, FIXED_STEP])
 def test_members_of_a_batch_keep_what_each_needs(adjoint):
     """One of few steps with strong friction, beside one of many."""
@@ -93,6 +94,7 @@ def squares(rows):
     return jnp.sum(jnp.where(jnp.isfinite(rows), rows, 0) ** 2)
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("adjoint", [REVERSIBLE, FIXED_STEP])
 @pytest.mark.parametrize(
     "varies, steps, max_steps", [(False, 0, 5), (False, 3, 40), (True, 0, 5)]

@@ -85,6 +85,7 @@ def test_masses(mass, p, expected):
     assert_close(velocity, jax.grad(kinetic, 1)(T, p), 1e-14)
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("constrained", [False, True])
 @pytest.mark.parametrize("n", [3, 10, 20])
 def test_a_matrix_is_factorised_once(n, constrained):

@@ -184,6 +184,7 @@ def test_friction_that_ceases_takes_shorter_steps_until_then(name, solver):
     assert np.max(error) < 3 * np.max(error[:, ::4]) < 3e-3
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("solver", [dps.BlanesMoanRKN4(), GAUSS(2)])
 def test_gradients_where_some_values_are_shorter_steps(solver):
     """Alone, and in a batch of which one member takes none, and one no other."""

@@ -111,6 +111,7 @@ def test_a_singular_law_beside_another_one_leaves_order_three(solver, law, t0):
     assert coarse < largest and fine < largest / 6
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("friction", [[dps.LogDamping(3.0)], []], ids=["two", "one"])
 def test_gradients_by_variable_steps_from_a_singular_start(friction):
     step = dps.StepDensityController(0.1, lambda t, y, args: 1 / (1 + y[0][0] ** 2))
@@ -177,6 +178,7 @@ def by_scipy(delta, ts):
     ).y
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize(
     "delta, error", [(0.5, 2e-3), (1.5, 1e-5), (2.0, 1e-6), (2.5, 1e-6)]
 )
@@ -201,6 +203,7 @@ def test_gradients_by_the_exponent_of_values_between_steps():
     assert jax.grad(total)(0.6) == pytest.approx(float(wanted), rel=1e-7)
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("adjoint", [OWN, dfx.RecursiveCheckpointAdjoint()])
 @pytest.mark.parametrize("delta", [1.5, 2.0])
 def test_backwards_to_the_start_of_a_power_of_time(delta, adjoint):

@@ -288,6 +288,7 @@ def test_a_density_without_a_rate_at_the_start():
     assert_close(last(sol.ys)[0], Y0[1] * np.sin(1.0), 1e-3)
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("throw", [False, True])
 def test_epsilon_is_found_in_any_unit_of_time(throw):
     def chosen(unit, **first):

@@ -156,6 +156,7 @@ def test_gradients_are_those_of_the_saved_values(way):
     np.testing.assert_allclose(jax.grad(fn)(AT), wanted, rtol=1e-8)
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("way", WAYS)
 def test_gradients_of_the_ends_of_steps_and_of_their_times(way):
     """Times depend on the states before them."""
@@ -255,6 +256,7 @@ def test_schemes_up_to_order_two_and_constraints_take_shorter_steps():
     np.testing.assert_allclose(jnp.sum(solved.ys[0] ** 2, axis=1), 1, 1e-13)
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("way", WAYS)
 def test_gradients_where_some_values_are_shorter_steps(way):
     """Alone, and in a batch of which one member takes none, and one no other."""
@@ -281,6 +283,7 @@ AT_ENDS = {
 }
 
 
+@pytest.mark.variants(1)
 @pytest.mark.parametrize("solver", AT_ENDS)
 @pytest.mark.parametrize("way", WAYS)
 def test_gradients_of_a_value_saved_where_a_step_ends(way, solver):
