@@ -36,23 +36,23 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     """The loop for steps that are known beforehand or reversible, and exact gradients
     in it: the recommended way to solve.
 
-    Between steps the solution is a Hermite interpolation of degree 15 from four ends of
-    steps, and within the steps of `StepDensityController` of degree 7 from the two ends
-    of a step. Within long steps of schemes with many stages, `TunedRKN6`,
-    `PresymplecticGauss` and compositions of compositions, its error may be larger than
-    that at the ends. Across kinks of the force it is wrong: give their times to
-    `StepsBetween`, also where steps of one length end at all of them. Where it cannot
-    follow the motion, it is a shorter step: of schemes up to order two, of
-    `TunedLinear8`, of systems with constraints or on manifolds, in spans of fewer than
-    three steps, where neighbouring steps of `diffrax.StepTo` differ by more than a
-    factor of two, and where friction over a step is more than 0.5, its rate has no
-    second derivative by time, or its matrix turns momenta by more than a radian. The
-    statistics say how many values are interpolated, `sol.stats["interpolated"]`. How
-    strong friction by place or by speed, of a `LagrangianSystem` or in a `force` is, is
-    estimated at the start of the solve alone (a relaxation of 1 over a step): if it
-    grows, choose the step by `choose_step` from a solve that saves the same times. With
-    `StepDensityController` values with such friction are shorter steps. The force must
-    have two derivatives by `jax.jvp`.
+    Between steps the solution is a Hermite interpolation of degree 15, or 11 of schemes
+    of order four, from four ends of steps, and within the steps of
+    `StepDensityController` of degree 7 from the two ends of a step. Within long steps
+    of schemes with many stages, `TunedRKN6`, `PresymplecticGauss` and compositions of
+    compositions, its error may be larger than that at the ends. Across kinks of the
+    force it is wrong: give their times to `StepsBetween`, also where steps of one
+    length end at all of them. Where it cannot follow the motion, it is a shorter step:
+    of schemes up to order two, of `TunedLinear8`, of systems with constraints or on
+    manifolds, in spans of fewer than three steps, where neighbouring steps of
+    `diffrax.StepTo` differ by more than a factor of two, and where friction over a step
+    is more than 0.5, its rate has no second derivative by time, or its matrix turns
+    momenta by more than a radian. The statistics say how many values are interpolated,
+    `sol.stats["interpolated"]`. How strong friction by place or by speed, of a
+    `LagrangianSystem` or in a `force` is, is estimated at the start of the solve alone
+    (a relaxation of 1 over a step): if it grows, choose the step by `choose_step` from
+    a solve that saves the same times. With `StepDensityController` values with such
+    friction are shorter steps. The force must have two derivatives by `jax.jvp`.
 
     A solve whose final or saved states are not finite fails; of an explicit scheme it
     ends at the next saved time or end of a step that is used for one, as other steps

@@ -1,7 +1,8 @@
 """Values between steps from the ends of several steps, at no stage of the scheme.
 
 Hermite interpolation of degree 15, from the states at the four ends of steps around a
-time, the nodes, and their first three derivatives along the motion.
+time, the nodes, and their first three derivatives along the motion; of degree 11, from
+two derivatives, for schemes of order four, to whose errors that adds nothing.
 """
 
 import math
@@ -25,7 +26,7 @@ from ._steps import Steps
 
 
 NODES = 4  # of a polynomial
-DERIVATIVES = 3  # in each
+DERIVATIVES = 3  # in each, of schemes of higher order than four
 # The largest ratio of neighbouring steps.
 _MOST_RATIO = 2.0
 
@@ -43,6 +44,7 @@ def derivatives(
     t: Array,
     point: Point,
     moment: Array | None = None,
+    number: int = DERIVATIVES,
 ) -> Node:
     """The state at a time of the solve, and its derivatives in that time, all but the
     first of a moment later."""
@@ -55,7 +57,7 @@ def derivatives(
     known, rate = [y, slope(t, y, force)], slope
     if moment is not None:
         t, y = t + cast_to(moment, t), tree.add_scaled(y, moment, known[1])
-    for _ in range(DERIVATIVES - 1):
+    for _ in range(number - 1):
         rate = _rate_of(rate)
         known.append(rate(t, y, *known[1:]))
     return jtu.tree_map(lambda *x: jnp.stack(x), *known)
@@ -71,17 +73,28 @@ def _rate_of(fn: Callable) -> Callable:
     return rate
 
 
+def number_of_derivatives(order: int) -> int:
+    """In each node, for a scheme of an order: the third takes longest to compile."""
+    return DERIVATIVES if order > 4 else DERIVATIVES - 1
+
+
 def node(
-    scheme: Scheme, system: System, steps: Steps, n: Array, side: Array, point: Point
+    scheme: Scheme,
+    system: System,
+    steps: Steps,
+    number: int,
+    n: Array,
+    side: Array,
+    point: Point,
 ) -> Node:
-    """The state at the start of a step, and its derivatives: where they jump, those
-    before it (-1) or after it (1)."""
+    """The state at the start of a step, and a number of its derivatives: where they
+    jump, those before it (-1) or after it (1)."""
     t, h, moment = steps.time(n), steps.lengths(n), None
     # A function of time may itself round to the other side.
     t = t + cast_to(side, t) * rounding_of(steps.t0, t, h)
     if system.external is not None:
         moment = _moment(jnp.where(side < 0, -h, h))
-    return derivatives(scheme, system, t, point, moment)
+    return derivatives(scheme, system, t, point, moment, number)
 
 
 def _moment(h: Array) -> Array:
@@ -134,7 +147,7 @@ class Stencils(eqx.Module):
     unit: Float[Array, " rows"]  # of time
     place: Float[Array, " rows"]  # in that unit
     nodes: Float[Array, "rows nodes"] | None  # if they are not 0, 1, 2, 3
-    weights: Float[Array, "rows nodes 4"]
+    weights: Float[Array, "rows nodes each"]  # of the state and its derivatives
     number: Int[Array, ""]  # of values where a polynomial can follow the solution
     # The first row that is interpolated; the earliest and the latest of these among the
     # members of a batch.
@@ -142,7 +155,9 @@ class Stencils(eqx.Module):
     earliest: Int[Array, ""]
     latest: Int[Array, ""]
 
-    def __init__(self, steps: Steps, rows: Rows, last: Array, first_node: Array):
+    def __init__(
+        self, steps: Steps, rows: Rows, last: Array, first_node: Array, each: int
+    ):
         stop = jnp.maximum(rows.stop, 0)
         begin = steps.time(stop)
         low, high = steps.smooth_part(stop)
@@ -155,7 +170,7 @@ class Stencils(eqx.Module):
         else:
             nodes = [steps.time(first + i) - begin for i in range(NODES)]
             self.nodes = jnp.stack(nodes, axis=-1) / self.unit[:, None]
-        self.weights = _weights(self.place, self.nodes, self.unit)
+        self.weights = _weights(self.place, self.nodes, self.unit, each)
         number, due = len(rows), rows.reached(last)
         before = (rows.stop >= 0) & (first < first_node)
         begin = jnp.max(jnp.where(before, jnp.arange(number) + 1, 0), initial=0)
@@ -168,6 +183,11 @@ class Stencils(eqx.Module):
         first = jnp.where(rows.stop < 0, -NODES, jnp.where(due, first, last + 1))
         self.first = jnp.append(first, last + 1)
 
+    def stack(self, y: State) -> Node:
+        """A state in place of itself and of each of its derivatives."""
+        each = self.weights.shape[-1]
+        return jtu.tree_map(lambda x: jnp.broadcast_to(x, (each, *jnp.shape(x))), y)
+
     def last(self, j: Any) -> Int[Array, "..."]:
         """The last node of a row, or of several."""
         return self.first[j] + NODES - 1
@@ -177,7 +197,7 @@ class Stencils(eqx.Module):
         here = (jnp.arange(len(rows)) >= self.begin) & (rows.stop >= 0)
         return jnp.where(here, self.last(slice(-1)), rows.known)
 
-    def _row(self, j: Array) -> Float[Array, "nodes 4"]:
+    def _row(self, j: Array) -> Float[Array, "nodes each"]:
         return _row_weights(j, self.weights, self.place, self.nodes, self.unit)
 
     def combine(self, j: Array, n: Array, ring: Node) -> State:
@@ -203,10 +223,10 @@ class Stencils(eqx.Module):
         return spread(self._row(j)[place], bar, ring)
 
 
-def _weights(place: Array, nodes: Array | None, unit: Array) -> Array:
-    """Those of the nodes of one row, or of each."""
+def _weights(place: Array, nodes: Array | None, unit: Array, number: int) -> Array:
+    """Those of the nodes of one row, or of each, and of a number of derivatives."""
     each: Any = range(NODES) if nodes is None else jnp.moveaxis(nodes, -1, 0)
-    return hermite(place, list(each), unit)
+    return hermite(place, list(each), unit, number)
 
 
 @jax.custom_batching.custom_vmap
@@ -232,7 +252,8 @@ def _(size, in_batched, j, weights, *how):
     if not in_batched[1]:
         row = lambda j: lax.dynamic_index_in_dim(weights, j, keepdims=False)
         return jax.vmap(row)(j), True
-    own = lambda j, *how: _weights(*jtu.tree_map(lambda x: x[j], how))
+    number = weights.shape[-1] - 1
+    own = lambda j, *how: _weights(*jtu.tree_map(lambda x: x[j], how), number=number)
     axes = jtu.tree_map(lambda x: 0 if x else None, (in_batched[0], *in_batched[2:]))
     return jax.vmap(own, axes, axis_size=size)(j, *how), True
 
@@ -247,10 +268,12 @@ def spread(weights: Array, bar: State, nodes: Node) -> Node:
     return jtu.tree_map(leaf, nodes, bar)
 
 
-def hermite(s: Array, nodes: list, unit: Array) -> Array:
+def hermite(
+    s: Array, nodes: list, unit: Array, derivatives: int = DERIVATIVES
+) -> Array:
     """The weights of the value and each derivative at each node, of lengths in a
     `unit`."""
-    weights, power = [], DERIVATIVES + 1
+    weights, power = [], derivatives + 1
     for i, node in enumerate(nodes):
         others = nodes[:i] + nodes[i + 1 :]
         inverse, d = [1 / (node - other) for other in others], s - node

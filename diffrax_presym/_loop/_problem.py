@@ -1,6 +1,7 @@
 """A solve with steps known beforehand or reversible, as functions of states alone."""
 
 from collections.abc import Callable
+from functools import partial
 
 import diffrax as dfx
 import equinox as eqx
@@ -15,7 +16,7 @@ from .._scheme._base import AbstractPresymplecticSolver, Point
 from .._scheme._engine import Result
 from .._system._bound import System
 from ._base import AbstractSteps
-from ._nodes import first_node, Node, node, Stencils
+from ._nodes import first_node, Node, node, number_of_derivatives, Stencils
 from ._rows import Row, Rows
 from ._steps import Steps
 from ._variable import VariableSteps
@@ -94,14 +95,14 @@ class Problem(eqx.Module):
         at_node = at_end = None
         resolved = scheme.is_resolved and solver.order(None) > 2
         if isinstance(steps, Steps) and some and resolved:
+            each = number_of_derivatives(solver.order(None))
             at_node = convert(
-                lambda n, side, point: node(scheme, system, steps, n, side, point),
-                *(n, n, start),
+                partial(node, scheme, system, steps, each), *(n, n, start)
             )
             first = first_node(system, steps, self.last, start[0])
             for i, rows in enumerate(self.rows):
                 if rows.may_be_inside:
-                    stencils = Stencils(steps, rows, self.last, first)
+                    stencils = Stencils(steps, rows, self.last, first, each)
                     self.stencils[i] = stencils
                     self.rows[i] = rows.known_after(stencils.known(rows))
         known = resolved and not system.has_unknown_friction

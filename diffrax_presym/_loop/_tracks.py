@@ -16,7 +16,7 @@ from .. import _tree as tree
 from .._numbers import cast_to, State
 from .._scheme._base import Point
 from ._base import Stop
-from ._nodes import DERIVATIVES, Node, NODES, Stencils
+from ._nodes import Node, NODES, Stencils
 from ._one_function import as_own_function
 
 
@@ -102,7 +102,7 @@ class Between(AbstractTrack):
     init: PyTree
 
     def start(self):
-        ring, zero = stack(stack(self.y, DERIVATIVES + 1), NODES), jnp.zeros((), int)
+        ring, zero = stack(self.stencils.stack(self.y), NODES), jnp.zeros((), int)
         rows = stack(self.init, len(self.stencils.first) - 1)
         begin = self.stencils.earliest
         return Collected(zero, zero, begin, ring, rows, jnp.asarray(True))

@@ -275,8 +275,8 @@ class TunedRKN6(AbstractSplitting):
     steps.
 
     For quadratic kinetic energies, also of rigid bodies and on manifolds, or quadratic
-    potentials: the first choice, with `choose_step`. For oscillations about equilibria its error is much smaller than that
-    of `BlanesMoanRKN6` at equal cost.
+    potentials: the first choice, with `choose_step`. For oscillations about equilibria
+    its error is much smaller than that of `BlanesMoanRKN6` at equal cost.
 
     Source: this package, `benchmarks/tuning.py`. The coefficients satisfy the
     conditions of order 6, and reduce the remaining error for oscillators over a range

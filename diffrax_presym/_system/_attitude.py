@@ -23,10 +23,11 @@ class Attitude(AbstractManifold):
 
     The free rotation is by Jacobi's elliptic functions, and one integral by quadrature.
     In steps in which the body turns by less than 2 radians its error is that of
-    rounding, of derivatives too, if no moment is larger than the sum of the others. The solve fails if the momentum turns by more than half of a circle in a
-    step, relative to the body, or so unevenly that the quadrature may miss it. Of 6e4
-    steps of random bodies, by up to 25 radians, the largest error was then 4e-6, and
-    1e-7 where the momentum turns by less than 2 radians. A potential takes the matrix,
+    rounding, of derivatives too, if no moment is larger than the sum of the others. The
+    solve fails if the momentum turns by more than half of a circle in a step, relative
+    to the body, or so unevenly that the quadrature may miss it. Of 6e4 steps of random
+    bodies, by up to 25 radians, the largest error was then 4e-6, and 1e-7 where the
+    momentum turns by less than 2 radians. A potential takes the matrix,
     `rotation_matrix(q)`.
 
     ??? cite "Reference"
