@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 
-# What a value costs that is interpolated, in steps of fourteen stages. Of a scheme with
-# fewer it is more, up to 0.6 with six, and of a single number less.
+# What a value costs that is interpolated, in steps, if there are as many of these.
 _INTERPOLATED = 1 / 3
 
 
