@@ -11,6 +11,10 @@ much memory are omitted, and the longest are made once.
 `--batches` measures one pendulum each under `vmap`, in batches of 1, 64, 1000 and 4096,
 with the gradient for each member, with the leapfrog and with `TunedRKN6`.
 
+`--network` measures value and gradient of a loss over 100 saved times by the weights of
+a network that is the potential, with steps for an error of 1e-5 there, and their first
+call, beside Diffrax's solvers with its own loop.
+
 Memory is what XLA reports that the compiled program needs in addition to its arguments.
 
 `--damping` finds the strongest damping of a pendulum, of 8 rates in each decade, up to
@@ -24,13 +28,14 @@ from functools import partial
 from typing import Any
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from _report import command_line, Table
 from _schemes import SCHEMES
 from _solve import solve
-from _timing import interleaved
+from _timing import interleaved, timed
 
 import diffrax_presym as dps
 
@@ -178,6 +183,68 @@ def memory(n, counts):
         table.row(steps, *(analysis.temp_size_in_bytes / 1e6 for analysis in used))
 
 
+def network(n, tolerance=1e-5, repeats=21):
+    """The potential is a network, and the loss is of its weights."""
+    fn = eqx.nn.MLP(n, "scalar", 64, 2, jnp.tanh, key=jax.random.key(0))
+    weights, rest = eqx.partition(fn, eqx.is_inexact_array)
+    ts, y0 = jnp.linspace(0.0, T1, 101)[1:], (jnp.linspace(0.5, 1.0, n), jnp.zeros(n))
+    potential = lambda t, q, args: q @ q / 2 + eqx.combine(args, rest)(q)
+    system = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), potential, dps.ConstantDamping(0.1)
+    )
+
+    def run(solver, step, weights, tol=None) -> Any:
+        options: dict = {"adjoint": REVERSAL, "max_steps": None}
+        if not isinstance(solver, dps.extend.AbstractPresymplecticSolver):
+            options = {"max_steps": 4096}
+        if tol is not None:
+            controller = dfx.PIDController(rtol=tol, atol=tol)
+            options["stepsize_controller"] = controller
+        return dfx.diffeqsolve(
+            *(system, solver, 0.0, T1, step, y0, weights),
+            saveat=dfx.SaveAt(ts=ts),
+            **options,
+        )
+
+    exact = run(dfx.Dopri8(), None, weights, 1e-12).ys
+    error = lambda ys: max(
+        float(jnp.max(jnp.abs(y - z))) for y, z in zip(ys, exact, strict=True)
+    )
+    solves = {}
+    for name in ("BlanesMoanRKN4", "TunedRKN6", "Tsit5", "Dopri8"):
+        solver = getattr(dps if hasattr(dps, name) else dfx, name)()
+        constant = jax.jit(lambda dt0, solver=solver: run(solver, dt0, weights))
+        step = dps.choose_step(constant, 0.0, T1, rtol=0.0, atol=tolerance)
+        solves[f"{name}, constant"] = partial(run, solver, float(step.dt0))
+        if hasattr(dfx, name):
+            fn = jax.jit(lambda tol, solver=solver: run(solver, None, weights, tol).ys)
+            tols = (10.0 ** (-k / 4) for k in range(12, 48))
+            tol = next(x for x in tols if error(fn(x)) <= tolerance)
+            solves[f"{name}, adaptive"] = partial(run, solver, None, tol=tol)
+    calls, first, errors = {}, {}, {}
+    for name, saved in solves.items():
+        loss = lambda weights, saved=saved: jnp.sum(saved(weights).ys[0] ** 2)
+        calls[name] = partial(jax.jit(jax.value_and_grad(loss)), weights)
+        first[name] = timed(calls[name])[1]
+        errors[name] = error(saved(weights).ys)
+    found = interleaved(calls, repeats)
+    table = Table(
+        f"A network as potential of {n} unknowns, value and gradient by its weights",
+        *(
+            "solver:<24",
+            "error:>9.1e",
+            "first, s:>10.1f",
+            "ms:>9.2f",
+            "over best:>10.2f",
+        ),
+    )
+    theirs = [name for name in calls if hasattr(dfx, name.split(",")[0])]
+    best = found[min(theirs, key=lambda name: found[name].median)]
+    for name in calls:
+        time = found[name].median * 1e3
+        table.row(name, errors[name], first[name], time, found[name].over(best))
+
+
 RATES = 10 ** (np.arange(-8, 57) / 8)
 # Schemes that have an inverse.
 INVERTIBLE = {
@@ -240,12 +307,17 @@ def strongest_damping(counts):
 def main():
     parser = command_line(__doc__)
     parser.add_argument("--batches", action="store_true", help="only the batches")
+    parser.add_argument("--network", action="store_true", help="only the network")
     parser.add_argument("--damping", action="store_true", help="only strong damping")
     options = parser.parse_args()
     quick = options.quick
     repeats = 2 if quick else 5
     if options.damping:
         return strongest_damping((40,) if quick else (40, 400, 4000))
+    if options.network:
+        for n in (2,) if quick else (2, 64):
+            network(n, repeats=2 if quick else 21)
+        return
     print(f"Median of {repeats} runs")
     batch_sizes = (1, 1000) if quick else (1, 64, 1000, 4096)
     batches(batch_sizes, (100,) if quick else (1000, 10_000), repeats)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 
-# What a value costs that is interpolated, in steps, if there are as many of these.
+# What an interpolated value costs, in steps, if there are about as many as steps.
 _INTERPOLATED = 1 / 3
 
 
