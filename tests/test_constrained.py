@@ -303,7 +303,7 @@ def test_an_initial_state_is_judged_without_a_unit_of_time(adjoint):
 @pytest.mark.parametrize(
     "solver",
     [
-        *(dps.PresymplecticLeapfrog(), dps.PresymplecticEuler(), dps.TunedRKN6()),
+        *(dps.PresymplecticLeapfrog(), dps.PresymplecticEuler()),
         *(dps.PresymplecticGauss(2), dps.PresymplecticTao(), dps.TunedLinear8()),
         *(dps.SymmetricMultistep(8), dps.SuzukiYoshida(4)),
         *(own.SpringLeapfrog(), dps.Suzuki4(own.SpringLeapfrog())),
@@ -312,7 +312,7 @@ def test_an_initial_state_is_judged_without_a_unit_of_time(adjoint):
 )
 def test_schemes_that_leave_the_constraint_refuse(solver):
     y0 = jnp.array([1.0, 0.0, 0.0]), jnp.zeros(3)
-    with pytest.raises(ValueError, match=r"(would leave|only without).*Strang"):
+    with pytest.raises(ValueError, match=r"would leave the manifold.*Strang"):
         diffeqsolve(sphere(), solver, 0.0, 1.0, 0.1, y0)
 
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 from catalogue import build, claim, offered, Problem, Refused
-from on_manifolds import CASES, DRIFTS, start
+from on_manifolds import bobs, CASES, DRIFTS, links, start
 from rows import SAMPLE
 
 import diffrax_presym as dps
@@ -51,6 +51,15 @@ def check_refusal(system, friction, scheme):
 def test_nystrom_schemes_on_manifolds_refuse_friction_in_kicks(case):
     message = r"`TunedRKN6` keeps its order.*one rate.*`BlanesMoan6\(\)`"
     problem = CASES[case][0], dps.TunedRKN6(), 0.0, 1.0, 0.1, start(case)
+    with pytest.raises(ValueError, match=message):
+        dfx.diffeqsolve(*problem)
+
+
+def test_nystrom_schemes_refuse_constraints():
+    free = dps.MechanicalSystem(dps.QuadraticKinetic(), lambda t, q, args: jnp.sum(q))
+    y0 = bobs([0.5, 1.0]), jnp.zeros((2, 2))
+    problem = dps.ConstrainedSystem(free, links), dps.TunedRKN6(), 0.0, 1.0, 0.1, y0
+    message = r"`TunedRKN6` keeps its order.*only without constraints.*Strang"
     with pytest.raises(ValueError, match=message):
         dfx.diffeqsolve(*problem)
 

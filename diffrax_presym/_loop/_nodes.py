@@ -147,7 +147,7 @@ class Stencils(eqx.Module):
     unit: Float[Array, " rows"]  # of time
     place: Float[Array, " rows"]  # in that unit
     nodes: Float[Array, "rows nodes"] | None  # if they are not 0, 1, 2, 3
-    weights: Float[Array, "rows nodes each"]  # of the state and its derivatives
+    weights: Float[Array, "rows nodes each"]
     number: Int[Array, ""]  # of values where a polynomial can follow the solution
     # The first row that is interpolated; the earliest and the latest of these among the
     # members of a batch.
@@ -183,10 +183,10 @@ class Stencils(eqx.Module):
         first = jnp.where(rows.stop < 0, -NODES, jnp.where(due, first, last + 1))
         self.first = jnp.append(first, last + 1)
 
-    def stack(self, y: State) -> Node:
-        """A state in place of itself and of each of its derivatives."""
-        each = self.weights.shape[-1]
-        return jtu.tree_map(lambda x: jnp.broadcast_to(x, (each, *jnp.shape(x))), y)
+    @property
+    def each(self) -> int:
+        """The number of values in a node: the state and its derivatives."""
+        return self.weights.shape[-1]
 
     def last(self, j: Any) -> Int[Array, "..."]:
         """The last node of a row, or of several."""

@@ -87,7 +87,7 @@ class PullNodes(AbstractPull):
     stencils: Stencils
 
     def start(self, backward):
-        n, node = backward.trace.n, self.stencils.stack(backward.trace.end[0])
+        n, node = backward.trace.n, stack(backward.trace.end[0], self.stencils.each)
         # The first that is not known.
         number = jnp.argmax(self.stencils.last(slice(None)) > n)
         return n + 1, n + 1, number, zeros(stack(node, NODES))

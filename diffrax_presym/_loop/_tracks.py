@@ -102,9 +102,10 @@ class Between(AbstractTrack):
     init: PyTree
 
     def start(self):
-        ring, zero = stack(self.stencils.stack(self.y), NODES), jnp.zeros((), int)
+        node, zero = stack(self.y, self.stencils.each), jnp.zeros((), int)
         rows = stack(self.init, len(self.stencils.first) - 1)
         begin = self.stencils.earliest
+        ring = stack(node, NODES)
         return Collected(zero, zero, begin, ring, rows, jnp.asarray(True))
 
     def _due(self, state: Collected) -> tuple[Array, Array]:

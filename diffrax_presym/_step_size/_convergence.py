@@ -122,10 +122,11 @@ def find_steps(
     report: Callable[[Trial], None],
 ) -> Choice:
     law = grid = doubted = None
+    interpolates: dict[int, bool] = {}  # whether a solve does, by its number of steps
     same, numbers, expected = 0, doubling(4), float
     while expected(n := next(numbers)) <= max_steps:
         finest, last = solve(n), law and law.finest
-        expected = finest.expected
+        expected, interpolates[n] = finest.expected, finest.interpolates
         if grid is None and finest.finite:
             # Of a solve that fails, the saved times are not known.
             grid = Grid.of(finest.ts, *times)
@@ -153,11 +154,10 @@ def find_steps(
         report(high)
         converges = len(law.ladder) > 1 and (law.converges or law.agrees)
         if grid and high.error <= 1 and (converges or doubted):
-            interpolates = {x.number: x.interpolates for x in (last, finest)}
 
-            def measure(n: int, law: Law = law, known: dict = interpolates) -> Trial:
+            def measure(n: int, law: Law = law) -> Trial:
                 solution = law.finest if n == law.finest.number else solve(n)
-                known[n] = solution.interpolates
+                interpolates[n] = solution.interpolates
                 report(trial := law.trial(solution))
                 return trial
 
