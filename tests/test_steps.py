@@ -169,6 +169,23 @@ def test_a_solve_ends_at_the_next_saved_time_after_it_has_failed():
     assert np.all(np.isinf(sol.ts[3:])) and np.all(np.isinf(sol.ys[0][3:]))
 
 
+@pytest.mark.parametrize("solver", [dps.BlanesMoanRKN4(), dps.TunedRKN6()])
+def test_derivatives_that_are_not_finite_at_the_end_of_a_step_are_a_failure(solver):
+    """The states are finite, but what is interpolated from there is not."""
+    potential = lambda t, q, args: jnp.sum(jnp.abs(q) ** 1.5)
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), potential)
+    y0 = jnp.zeros(2), jnp.array([1.0, 0.0])
+
+    def result(**options):
+        args: Any = system, solver, 0.0, 10.0, 0.1, y0
+        return dfx.diffeqsolve(*args, adjoint=OWN, throw=False, **options).result
+
+    assert result() == dfx.RESULTS.successful
+    at_steps = dfx.SaveAt(ts=jnp.arange(10.0))
+    assert result(saveat=at_steps) == dfx.RESULTS.successful
+    assert result(saveat=dfx.SaveAt(ts=jnp.linspace(0.0, 10.0, 33))) == NONFINITE
+
+
 @pytest.mark.parametrize("adjoint", [OWN, dfx.RecursiveCheckpointAdjoint()])
 def test_a_step_that_is_too_long_is_a_failure(adjoint):
     sol = too_long(1000.0, 25.0, adjoint=adjoint)

@@ -124,8 +124,8 @@ class Between(AbstractTrack):
         kink = jnp.zeros((), int)
         if self.kinks is not None:
             kink = jnp.any(self.kinks == n).astype(int)
-        last = jtu.tree_map(lambda x: x[n % NODES], state.ring)
-        node = apart(n, own, lambda: self.node(n, -kink, point), last)
+        like = stack(self.y, self.stencils.each)
+        node = apart(n, own, lambda: self.node(n, -kink, point), like)
         save = lambda state: self._visit_node(state, node, n, kink, point, own)
         return where_any(own, save, state)
 
@@ -168,7 +168,8 @@ class Between(AbstractTrack):
             other = lambda: self.node(n, kink, point)
             after = lambda: put_here(ring, n % NODES, other(), here)
             ring = lax.cond(kink == 1, after, lambda: ring)
-        finite &= ~here | tree.all_finite(node)
+        total = jtu.tree_map(lambda x: jnp.sum(0 * x, axis=0), node)
+        finite &= ~here | tree.all_finite(total)
         due = jnp.where(here, n + 1, state.node)
         return Collected(state.shorter, due, j, ring, rows, finite)
 
