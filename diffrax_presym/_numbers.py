@@ -19,6 +19,13 @@ def cast_to(x: ArrayLike, like: ArrayLike) -> Array:
     return jnp.asarray(x, dtype if jnp.issubdtype(dtype, jnp.inexact) else None)
 
 
+def rounding_of(t0: Array, t: Array, length: Array) -> Array:
+    """By how much the end of a step may differ from the same time computed otherwise,
+    in a solve that begins at `t0`."""
+    largest = jnp.maximum(jnp.abs(t0), jnp.abs(t))
+    return jnp.minimum(4 * float(jnp.finfo(t.dtype).eps) * largest, length / 64)
+
+
 def as_time(t: ArrayLike) -> Array:
     """A time as a floating-point array."""
     if jnp.issubdtype(jnp.result_type(t), jnp.inexact):

@@ -195,3 +195,43 @@ def test_steps_that_end_where_a_force_jumps(solver, least, most):
     ends = [np.concatenate([x[-1] for x in solve(h).ys]) for h in (0.3, 0.15)]
     first, second = (np.max(np.abs(end - y)) for end in ends)
     assert least < np.log2(first / second) < most
+
+
+@pytest.mark.parametrize("adjoint", [dps.FixedStepAdjoint(), dfx.DirectAdjoint()])
+@pytest.mark.parametrize("ends", [(0.0, 3.0), (3.0, 0.0)])
+@pytest.mark.parametrize("above", [jnp.greater, jnp.greater_equal])
+@pytest.mark.parametrize(
+    "solver, limit", [(dps.BlanesMoanRKN6(), 1e-12), (dps.BlanesMoan4(), 1e-7)]
+)
+def test_values_beside_a_jump(adjoint, ends, above, solver, limit):
+    """Whichever of the two values the force has at the time of the jump itself."""
+    jumps, (t0, t1) = (1.0, 2.0), ends
+
+    def potential(t, q, args):
+        on = above(t, jumps[0]) & ~above(t, jumps[1])
+        return jnp.sum(q**2) / 2 - jnp.sum(q) * jnp.where(on, 1.0, 0.0)
+
+    near = [time + side for time in jumps for side in (-1e-3, -1e-6, 0.0, 1e-6, 1e-3)]
+    ts = np.sort([*np.linspace(0.0, 3.0, 301), *near])[:: 1 if t0 < t1 else -1]
+
+    def exact(t, x=0.0, v=1.0):
+        begin, pull = t0, 0.0
+        for end in (*(jumps if t0 < t1 else jumps[::-1]), t1):
+            past = abs(t - t0) > abs(end - t0)
+            angle, away = (end if past else t) - begin, x - pull
+            x = pull + away * np.cos(angle) + v * np.sin(angle)
+            v = v * np.cos(angle) - away * np.sin(angle)
+            if not past:
+                break
+            begin, pull = end, 1.0 - pull
+        return x, v
+
+    sol: Any = dfx.diffeqsolve(
+        dps.MechanicalSystem(dps.QuadraticKinetic(), potential),
+        *(solver, t0, t1, 0.1 if t0 < t1 else -0.1, (jnp.zeros(1), jnp.ones(1))),
+        stepsize_controller=dps.StepsBetween(jnp.array(jumps)),
+        adjoint=adjoint,
+        saveat=dfx.SaveAt(ts=jnp.asarray(ts)),
+    )
+    right = np.array([exact(t) for t in ts])
+    assert np.max(np.abs(np.concatenate(sol.ys, axis=1) - right)) < limit

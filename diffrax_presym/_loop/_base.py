@@ -30,13 +30,6 @@ class Stop(NamedTuple):
     time: Float[Array, ""] | None = None
 
 
-def rounding_of(t0: Array, t: Array, length: Array) -> Array:
-    """By how much the end of a step may differ from the same time computed otherwise,
-    in a solve that begins at `t0`."""
-    largest = jnp.maximum(jnp.abs(t0), jnp.abs(t))
-    return jnp.minimum(4 * float(jnp.finfo(t.dtype).eps) * largest, length / 64)
-
-
 def follows(system: System, t0: Array, h: Array) -> Any:
     """Whether polynomials can follow the motion over a step: the logarithm of a decay,
     or half of the angle of a rotation, is small."""

@@ -17,10 +17,10 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int, PyTree
 
 from .. import _tree as tree
-from .._numbers import cast_to, State
+from .._numbers import cast_to, rounding_of, State
 from .._scheme._base import Point, Scheme
 from .._system._bound import System
-from ._base import MOST_FRICTION, MOST_STEPS, rounding_of
+from ._base import MOST_FRICTION, MOST_STEPS
 from ._rows import Rows
 from ._steps import Steps
 

@@ -13,13 +13,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .. import _tree as tree
 from .._checks import as_finite
-from .._numbers import cast_to
+from .._numbers import cast_to, rounding_of
 from .._scheme._base import advance, Scheme
 from .._scheme._engine import backward, is_autonomous, Span
 from .._scheme._failure import explain, unless_too_strong
 from .._scheme._prepare import prepare, prepare_once
 from .._system._bound import System
-from ._base import AbstractSteps, follows, MOST_STEPS, rounding_of, Stop
+from ._base import AbstractSteps, follows, MOST_STEPS, Stop
 
 
 _OTHER_ENDS = (

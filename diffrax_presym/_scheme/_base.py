@@ -7,12 +7,13 @@ from typing import Any, ClassVar, NamedTuple
 import diffrax as dfx
 import equinox as eqx
 import jax.lax as lax
+import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
 from .. import _tree as tree
 from .._interpolation import HermiteInterpolation, inner_points
-from .._numbers import cast_to, State
+from .._numbers import cast_to, rounding_of, State
 from .._results import NONFINITE
 from .._system._bound import bind, System, unwrap
 from ._engine import (
@@ -133,7 +134,7 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver):
         span = Span(t0, t1, t1 - t0)
         start = y0, carry
         end, result = advance(scheme, system, span, start)
-        info = dense_info(self, scheme, system, span, start, end)
+        info = dense_info(self, scheme, system, span, start, end, made_jump)
         result = check_step(scheme, system, span, start, end, result)
         return end[0], None, info, end[1], result
 
@@ -179,12 +180,18 @@ def dense_info(
     span: Span,
     start: Point,
     end: Point,
+    made_jump: Any,
 ) -> dict[str, PyTree]:
-    """The data for the interpolation of a step, from its two ends."""
+    """The data for the interpolation of a step, from its two ends; derivatives are
+    those within it, where a force may jump at these."""
     t0, t1, h = span
     slope = lambda t, x: system.slope(t, x[0], scheme.end_force(x[1]))
     y0, y1 = (system.values(x[0]) for x in (start, end))
-    k0, k1 = (tree.scale(h, slope(*x)) for x in ((t0, start), (t1, end)))
+    # A function of time may itself round to the other side.
+    rounding = jnp.sign(h) * rounding_of(t0, t1, jnp.abs(h))
+    begin = t0 if made_jump is False else t0 + jnp.where(made_jump, rounding, 0)
+    ends = (begin, start), (t1 - rounding, end)
+    k0, k1 = (tree.scale(h, slope(*x)) for x in ends)
     info = dict(y0=y0, y1=y1, k0=k0, k1=k1)
     # The order of a scheme does not depend on the term.
     number = _INNER_POINTS[bisect.bisect_left(_ORDERS, solver.order(None))]
