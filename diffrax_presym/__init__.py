@@ -12,7 +12,7 @@ from ._friction._viscous import (
     ViscousDamping as ViscousDamping,
 )
 from ._loop._adjoint import FixedStepAdjoint as FixedStepAdjoint
-from ._loop._steps import StepsBetween as StepsBetween
+from ._loop._steps_between import StepsBetween as StepsBetween
 from ._scheme._compensated import Compensated as Compensated
 from ._scheme._composition import (
     Composition as Composition,

@@ -3,6 +3,7 @@
 there."""
 
 import itertools
+from functools import partial
 from typing import Any
 
 import diffrax as dfx
@@ -164,20 +165,23 @@ def test_steps_between_kinks_are_chosen_and_differentiated():
     assert jax.grad(end)(push) @ along == pytest.approx(float(difference), rel=1e-7)
 
 
-# A force that jumps at the end of a step: a scheme that takes it there sees one side,
-# and has order one.
+# A force that jumps at the end of a step. Only the stages of triple jumps go beyond.
 ORDERS = [
     (dps.BlanesMoan4(), 3.5, np.inf),
     (dps.BlanesMoan6(), 5, np.inf),
     (dps.BlanesMoanRKN6(), 5, np.inf),
     (dps.PresymplecticGauss(3), 5, np.inf),
     (dps.PresymplecticLeapfrog("position"), 1.8, np.inf),
-    *((x, 0.7, 1.3) for x in (RKN6, RKN4, dps.Strang(), dps.PresymplecticLeapfrog())),
-    (dps.PresymplecticTao(3.0), 0.7, 1.3),
+    (RKN6, 5, np.inf),
+    (RKN4, 3.5, np.inf),
+    (dps.Suzuki4(dps.Strang()), 3.5, np.inf),
+    (dps.PresymplecticLeapfrog(), 1.8, np.inf),
+    (dps.PresymplecticTao(3.0), 1.8, np.inf),
+    (dps.SuzukiYoshida(4, dps.Strang()), 0.7, 2.0),
 ]
 
 
-@pytest.mark.variants(10)
+@pytest.mark.variants(len(ORDERS))
 @pytest.mark.parametrize("solver, least, most", ORDERS)
 def test_steps_that_end_where_a_force_jumps(solver, least, most):
     jump, t1 = 0.9, 2.0
@@ -197,11 +201,19 @@ def test_steps_that_end_where_a_force_jumps(solver, least, most):
     assert least < np.log2(first / second) < most
 
 
+# To this function of time the time before a jump is after it.
+early = lambda t, jump: t * (1 + 3e-16) >= jump
+
+
 @pytest.mark.parametrize("adjoint", [dps.FixedStepAdjoint(), dfx.DirectAdjoint()])
 @pytest.mark.parametrize("ends", [(0.0, 3.0), (3.0, 0.0)])
-@pytest.mark.parametrize("above", [jnp.greater, jnp.greater_equal])
 @pytest.mark.parametrize(
-    "solver, limit", [(dps.BlanesMoanRKN6(), 1e-12), (dps.BlanesMoan4(), 1e-7)]
+    "above, solver, limit",
+    [
+        *((above, RKN6, 1e-12) for above in (jnp.greater, jnp.greater_equal)),
+        (jnp.greater, dps.BlanesMoan4(), 1e-7),
+        (early, dps.BlanesMoanRKN6(), 1e-12),
+    ],
 )
 def test_values_beside_a_jump(adjoint, ends, above, solver, limit):
     """Whichever of the two values the force has at the time of the jump itself."""
@@ -235,3 +247,42 @@ def test_values_beside_a_jump(adjoint, ends, above, solver, limit):
     )
     right = np.array([exact(t) for t in ts])
     assert np.max(np.abs(np.concatenate(sol.ys, axis=1) - right)) < limit
+
+
+@pytest.mark.parametrize(
+    "solver", [RKN6, dps.Compensated(RKN4), dps.PresymplecticTao(3.0), dps.Strang()]
+)
+@pytest.mark.parametrize("above", [jnp.greater, jnp.greater_equal])
+def test_gradients_of_values_beside_a_jump(solver, above):
+    """The same by all ways back through the steps, and central differences."""
+    jumps, ts = jnp.array([0.7, 1.6]), jnp.linspace(0.0, 2.3, 24)
+
+    def potential(t, q, height):
+        on = above(t, jumps[0]) & ~above(t, jumps[1])
+        return cosine(t, q, None) - height * jnp.sum(q) * jnp.where(on, 1.0, -0.5)
+
+    system = system_of(potential, 0.1)
+
+    def loss(height, y0, adjoint):
+        sol: Any = dfx.diffeqsolve(
+            *(system, solver, 0.0, 2.3, 0.12, y0, height),
+            stepsize_controller=dps.StepsBetween(jumps),
+            saveat=dfx.SaveAt(ts=ts),
+            adjoint=adjoint,
+            max_steps=64,
+        )
+        weights = jnp.cos(jnp.arange(24.0))[:, None]
+        return sum(jnp.sum(weights * y**2) for y in sol.ys)
+
+    own = [("reversal", 2), ("reversal", None), ("checkpoints", 3)]
+    found = []
+    for adjoint in (*(dps.FixedStepAdjoint(*x) for x in own), dfx.DirectAdjoint()):
+        slopes = jax.jit(jax.grad(partial(loss, adjoint=adjoint), (0, 1)))
+        found.append(flat(slopes(0.8, Y0)))
+    value = jax.jit(partial(loss, y0=Y0, adjoint=dps.FixedStepAdjoint()))
+    difference = (value(0.8 + 1e-5) - value(0.8 - 1e-5)) / 2e-5
+    assert found[0][0] == pytest.approx(float(difference), rel=1e-8)
+    np.testing.assert_allclose(found[1:3], [found[0]] * 2, rtol=1e-10)
+    if not isinstance(solver, dps.PresymplecticTao):  # whose copies start anew there
+        # Between steps Diffrax's loop interpolates otherwise.
+        np.testing.assert_allclose(found[3], found[0], rtol=1e-2)

@@ -76,7 +76,7 @@ def test_steps_are_found_again_to_rounding(t0, t1, dt0, dtype):
     sol = dfx.diffeqsolve(*args, saveat=saveat, max_steps=32)
     n = int(sol.stats["num_steps"])
     with jax.numpy_dtype_promotion("standard"):  # as within `diffeqsolve`
-        steps = Steps(dfx.ConstantStepSize(), t0, t1, dt0)
+        steps = Steps(t0, t1, dt0)
         times = steps.time(jnp.arange(n + 1))
         middle = (times[:-1] + times[1:]) / 2
         starts, inside = steps.locate(times)

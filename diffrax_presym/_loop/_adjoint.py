@@ -24,7 +24,7 @@ from ._one_function import as_one_function
 from ._problem import Problem
 from ._pull import pulls
 from ._run import run, saved_rows
-from ._steps import Steps, StepsBetween
+from ._steps_between import known_steps, StepsBetween
 from ._variable import VariableSteps
 
 
@@ -141,7 +141,7 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         if isinstance(stepsize_controller, StepDensityController):
             steps = VariableSteps(t0, t1, stepsize_controller, dt0)
         else:
-            steps = Steps(stepsize_controller, t0, t1, dt0)
+            steps = known_steps(stepsize_controller, t0, t1, dt0)
         start, known = steps.join(carry, control), (carry, control)
 
         def begin(y: State) -> PyTree:

@@ -92,6 +92,7 @@ def node(
     t, h, moment = steps.time(n), steps.lengths(n), None
     # A function of time may itself round to the other side.
     t = t + cast_to(side, t) * rounding_of(steps.t0, t, h)
+    point = steps.renewed(scheme, system, n, system.time(t), point)
     if system.external is not None:
         moment = _moment(jnp.where(side < 0, -h, h))
     return derivatives(scheme, system, t, point, moment, number)

@@ -3,18 +3,14 @@
 from functools import partial, reduce
 from typing import Any, ClassVar
 
-import diffrax as dfx
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
-import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from .. import _tree as tree
-from .._checks import as_finite
-from .._numbers import cast_to, rounding_of
-from .._scheme._base import advance, Scheme
+from .._numbers import rounding_of
+from .._scheme._base import advance, between, Point, Scheme
 from .._scheme._engine import backward, is_autonomous, Span
 from .._scheme._failure import explain, unless_too_strong
 from .._scheme._prepare import prepare, prepare_once
@@ -27,77 +23,6 @@ _OTHER_ENDS = (
     "solve. Write `StepTo(jnp.concatenate([t0, ts, t1]))`, or use "
     "`StepsBetween(ts)`, which ignores times that are not between the two."
 )
-
-
-class StepsBetween(dfx.AbstractStepSizeController):
-    """Equal steps between given times, each no longer than `dt0`.
-
-    For a force or friction with kinks at known times, such as a table read by
-    `jax.numpy.interp`: a step across a kink has order two at most, steps that end there
-    keep the order of the scheme. Where the force jumps at these times, schemes that
-    take it at the ends of steps have order one: `TunedRKN6`, `BlanesMoanRKN4`,
-    `Strang`, `PresymplecticTao`, the momentum-first leapfrog and what is composed of
-    them; other schemes keep their order. The steps between two of the times are equal,
-    and as few as are not longer than `dt0`.
-
-    !!! example
-
-        ```python
-        times = jnp.array([0.0, 3.0, 4.0, 10.0])
-        forces = jnp.array([0.0, 1.0, -1.0, 0.0])
-        force = ForceField(lambda t, q, args: jnp.interp(t, times, forces) - q)
-        sol = diffeqsolve(
-            MechanicalSystem(QuadraticKinetic(), force),
-            *(TunedRKN6(), 0.0, 10.0, 1.0, (jnp.ones(1), jnp.zeros(1))),
-            stepsize_controller=StepsBetween(times), adjoint=FixedStepAdjoint(),
-        )
-        ```
-    """
-
-    times: Float[Array, " times"]  # sorted
-
-    def __init__(self, times):
-        """**Arguments:**
-
-        - `times`: the times at which steps end, in any order. Those that are not
-            between `t0` and `t1` are ignored.
-
-        **Raises:**
-
-        `ValueError` if they are not a vector of finite numbers.
-        """
-        given = jnp.atleast_1d(as_finite(times, "`StepsBetween(times)`"))
-        if given.ndim > 1:
-            raise ValueError(
-                "`StepsBetween(times)` must be a vector, but got the shape "
-                f"{given.shape}."
-            )
-        if isinstance(times, Tracer):
-            # Those that are not a number are known now only to be ignored.
-            self.times = jnp.sort(jnp.where(jnp.isnan(given), jnp.inf, given))
-        else:  # Once, rather than in each solve.
-            self.times = jnp.asarray(np.sort(np.atleast_1d(times)), given.dtype)
-
-    def wrap(self, direction):
-        times = self.times * cast_to(direction, self.times)
-        times = jnp.where(direction < 0, times[::-1], times)
-        return eqx.tree_at(lambda self: self.times, self, times)
-
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        if dt0 is None:
-            raise ValueError(
-                "`StepsBetween` needs the longest step. Write "
-                "`diffeqsolve(..., dt0=...)`."
-            )
-        steps = Steps(self, t0, t1, dt0)
-        return steps.time(jnp.ones((), int)), (jnp.ones((), int), steps)
-
-    def adapt_step_size(
-        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
-    ):
-        n, steps = controller_state
-        kink, state = jnp.any(steps.kinks == n), (n + 1, steps)
-        return True, t1, steps.time(n + 1), kink, state, dfx.RESULTS.successful
 
 
 class Steps(AbstractSteps):
@@ -114,18 +39,25 @@ class Steps(AbstractSteps):
     length: Float[Array, " parts"]  # of its steps
     ts: Float[Array, " ends"] | None  # of prescribed steps
 
-    def __init__(self, controller: dfx.AbstractStepSizeController, t0, t1, dt0):
+    def __init__(
+        self,
+        t0,
+        t1,
+        dt0,
+        times: Float[Array, " times"] | None = None,
+        ts: Float[Array, " ends"] | None = None,
+    ):
         self.t0, self.t1, self.ts = t0, t1, None
-        if isinstance(controller, dfx.StepTo):
-            ends = (controller.ts[0] == t0) & (controller.ts[-1] == t1)
-            self.ts = eqx.error_if(controller.ts, ~ends, _OTHER_ENDS)
-            self.count = jnp.full((), len(controller.ts) - 1)
+        if ts is not None:
+            ends = (ts[0] == t0) & (ts[-1] == t1)
+            self.ts = eqx.error_if(ts, ~ends, _OTHER_ENDS)
+            self.count = jnp.full((), len(ts) - 1)
             self.starts, self.first = t0[None], jnp.zeros(1, int)
             self.length = jnp.zeros_like(self.starts)
             return
         self.starts, ends = t0[None], t1[None]
-        if isinstance(controller, StepsBetween):
-            inner = jnp.clip(controller.times.astype(t0.dtype), t0, t1)
+        if times is not None:
+            inner = jnp.clip(times.astype(t0.dtype), t0, t1)
             self.starts = jnp.concatenate([self.starts, inner])
             ends = jnp.concatenate([inner, ends])
         spans, most = ends - self.starts, MOST_STEPS
@@ -235,8 +167,24 @@ class Steps(AbstractSteps):
         if len(self.starts) > 1:
             # Found by one search, and the end of the last step in a span to rounding.
             after = jnp.minimum(k + 1, len(self.starts) - 1)
-            t1 = jnp.where(end == self.first[after], self.starts[after], t1)
+            last = end == self.first[after]
+            t1 = jnp.where(last, self.starts[after], t1)
+            span = Span(*map(system.time, (t0, t1, self.length[k])))
+            # Beside a kink on their side of it.
+            kink, other = (n == self.first[k]) & (n > 0), span.rounding
+            t0 = span.t0 + jnp.where(kink, other, 0)
+            return span._replace(t0=t0, t1=span.t1 - jnp.where(last, other, 0))
         return Span(*map(system.time, (t0, t1, self.length[k])))
+
+    def renewed(
+        self, scheme: Scheme, system: System, n: Array, t: Array, point: Point
+    ) -> Point:
+        """The start of step `n`, at a kink with a solver state from one side of it."""
+        y, carry = point
+        if self.kinks is None or scheme.at_kink is None:
+            return point
+        kink, new = (n == self.first[self._part(n)]) & (n > 0), scheme.at_kink
+        return y, lax.cond(kink, lambda: new(system, t, y, carry), lambda: carry)
 
     def begin(self, n, point):
         return self.time(n)
@@ -293,13 +241,21 @@ class Steps(AbstractSteps):
         return unless_too_strong(scheme.most_friction, system, span, data)
 
     def step(self, scheme, system, n, point, data):
-        return advance(scheme, system, self.span(system, n), point, data)
+        span = self.span(system, n)
+        point = self.renewed(scheme, system, n, span.t0, point)
+        return advance(scheme, system, span, point, data)
 
     def undo(self, scheme, system, n, point, data):
         span = self.span(system, n)
+        point = self.renewed(scheme, system, n + 1, span.t1, point)
         if not self._prepares_once(scheme, system):
             data = prepare(scheme.moves, system, span, backward=True)
         return backward(scheme.moves, system, span, data, point)
+
+    def shorter(self, scheme, system, n, point, t):
+        t0, since = self.span(system, n).t0, self.since_begin(n, point, t)
+        point = self.renewed(scheme, system, n, t0, point)
+        return between(scheme, system, Span(t0, *map(system.time, (t, since))), point)
 
     def explain(self, scheme, system, n, ends, result):
         times = [system.time(self.time(i)) for i in (0 * n, n)]

@@ -13,7 +13,7 @@ from jaxtyping import Array, PyTree
 
 from .. import _tree as tree
 from .._interpolation import HermiteInterpolation, inner_points
-from .._numbers import cast_to, rounding_of, State
+from .._numbers import cast_to, State
 from .._results import NONFINITE
 from .._system._bound import bind, System, unwrap
 from ._engine import (
@@ -47,6 +47,9 @@ class Scheme(NamedTuple):
     ends: AbstractMove | None = None
     # The initial solver state, of the system, a time and a state.
     start: Callable[[System, Array, State], PyTree] = lambda system, t, y: None
+    # The solver state at a time on one side of a kink, from that there; `None` if it is
+    # the same on both.
+    at_kink: Callable[[System, Array, State, PyTree], PyTree] | None = None
     # From the solver state the force that ends a step, if it is known.
     end_force: Callable[[PyTree], PyTree | None] = lambda carry: None
     # Whether a step can be inverted from its end.
@@ -117,8 +120,11 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         system = bind(terms, args, y0)
         t0, t1 = system.time(t0), system.time(t1)
-        scheme = self.scheme(system)
-        restart = lambda: scheme.start(system, t0, y0)
+        scheme, span = self.scheme(system), Span(t0, t1, t1 - t0)
+        if made_jump is not False:
+            # To a function of time this may still be the time before it.
+            span = span._replace(t0=t0 + jnp.where(made_jump, span.rounding, 0))
+        restart = lambda: scheme.start(system, span.t0, y0)
         carry = solver_state
         if carry is None and jtu.tree_leaves(eqx.filter_eval_shape(restart)):
             raise ValueError(
@@ -131,10 +137,9 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver):
         # `False`, and nothing is traced.
         if made_jump is not False and jtu.tree_leaves(carry):
             carry = lax.cond(made_jump, restart, lambda: solver_state)
-        span = Span(t0, t1, t1 - t0)
         start = y0, carry
         end, result = advance(scheme, system, span, start)
-        info = dense_info(self, scheme, system, span, start, end, made_jump)
+        info = dense_info(self, scheme, system, span, start, end)
         result = check_step(scheme, system, span, start, end, result)
         return end[0], None, info, end[1], result
 
@@ -180,17 +185,13 @@ def dense_info(
     span: Span,
     start: Point,
     end: Point,
-    made_jump: Any,
 ) -> dict[str, PyTree]:
     """The data for the interpolation of a step, from its two ends; derivatives are
     those within it, where a force may jump at these."""
     t0, t1, h = span
     slope = lambda t, x: system.slope(t, x[0], scheme.end_force(x[1]))
     y0, y1 = (system.values(x[0]) for x in (start, end))
-    # A function of time may itself round to the other side.
-    rounding = jnp.sign(h) * rounding_of(t0, t1, jnp.abs(h))
-    begin = t0 if made_jump is False else t0 + jnp.where(made_jump, rounding, 0)
-    ends = (begin, start), (t1 - rounding, end)
+    ends = (t0, start), (t1 - span.rounding, end)
     k0, k1 = (tree.scale(h, slope(*x)) for x in ends)
     info = dict(y0=y0, y1=y1, k0=k0, k1=k1)
     # The order of a scheme does not depend on the term.

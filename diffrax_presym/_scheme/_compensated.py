@@ -77,12 +77,17 @@ class Compensated(AbstractPresymplecticSolver):
             lost = tree.zeros(y)
             return base.start(system, t, jtu.tree_map(tree.Sum, y, lost)), lost
 
+        def at_kink(system: System, t: Array, y: State, carry: PyTree) -> PyTree:
+            assert base.at_kink is not None
+            return base.at_kink(system, t, y, carry[0]), carry[1]
+
         inner = base.check
         check = inner and (lambda system, t, y, x: inner(system, t, y, x[0]))
         return base._replace(
             inner=base.moves,
             ends=ToSums(),
             start=start,
+            at_kink=base.at_kink and at_kink,
             end_force=lambda carry: base.end_force(carry[0]),
             check=check,
         )

@@ -19,7 +19,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._numbers import cast_to
+from .._numbers import cast_to, rounding_of
 from .._system._bound import System
 
 
@@ -48,6 +48,12 @@ class Span(NamedTuple):
             return self.t1 if fraction else self.t0
         # Rounding must not make the last stage miss the end of the step.
         return jnp.where(fraction == 1, self.t1, self.t0 + fraction * self.h)
+
+    @property
+    def rounding(self) -> Array:
+        """Forwards, by how much its ends may differ from the same times computed
+        otherwise, as by a function of time."""
+        return jnp.sign(self.h) * rounding_of(self.t0, self.t1, jnp.abs(self.h))
 
     @property
     def reversed(self) -> "Span":

@@ -148,10 +148,11 @@ class PresymplecticLeapfrog(AbstractPresymplecticSolver):
             # In both directions the first kick is by the force known from the last one.
             A = _momentum_first(self, system, known=True)
             moves = MoveSequence([A, inverse(A)], [(0, 0.5, 0.5), (0.5, 1, 0.5)])
-            start = lambda system, t, y: first_force(system, "separable", t, y)
+            start = lambda system, t, y, *_: first_force(system, "separable", t, y)
             return Scheme(
                 moves,
                 start=start,
+                at_kink=start,
                 end_force=lambda carry: carry,
                 pattern=_HALF + _HALF[::-1],
             )

@@ -79,8 +79,10 @@ class AbstractSplitting(AbstractPresymplecticSolver):
         )
         if not first:
             return scheme
+        start = lambda system, t, y, *_: first_force(system, kind, t, y)
         return scheme._replace(
-            start=lambda system, t, y: first_force(system, kind, t, y),
+            start=start,
+            at_kink=start,
             # Otherwise a kick is by a part of the force only.
             end_force=lambda carry: carry if "separable" in split.kinds else None,
         )

@@ -195,7 +195,12 @@ class PresymplecticTao(AbstractPresymplecticSolver):
             (0.5, 0.5, 1),
             *((0.5, 0.5, 0.5), (0.5, 1, 0.5), (1, 1, 0.5)),
         ]
-        start = lambda system, t, y: (y, system.velocity_and_force(t, y))
+
+        def at_kink(system: System, t: Array, y: State, carry: PyTree) -> PyTree:
+            """The field of the first exchange, of the same copy."""
+            copy, _ = carry
+            return copy, system.velocity_and_force(t, (y[0], copy[1]))
+
         not_composable = None
         if self.coupling is None:
             not_composable = (
@@ -207,7 +212,8 @@ class PresymplecticTao(AbstractPresymplecticSolver):
         moves = MoveSequence(moves, table)
         return Scheme(
             moves,
-            start=start,
+            start=lambda system, t, y: at_kink(system, t, y, (y, None)),
+            at_kink=at_kink,
             not_composable=not_composable,
             most_friction=_MOST_FRICTION,
         )

@@ -49,10 +49,9 @@ class ChosenStep(NamedTuple):
         scheme = "" if claim is None else f", that of the scheme {claim}"
         note = (
             " The errors do not fall as those of a smooth motion, and may be larger "
-            "than expected. If the force has kinks, or the friction jumps, at known "
-            "times, write `stepsize_controller=StepsBetween(times)`; where a force "
-            "jumps, end the solve and begin another; where it changes fast at unknown "
-            "times, as dry friction that is smoothed, use an adaptive solver."
+            "than expected. If force or friction has kinks or jumps at known times, "
+            "write `stepsize_controller=StepsBetween(times)`; where it changes fast at "
+            "unknown times, as dry friction that is smoothed, use an adaptive solver."
         )
         limit = (
             " Steps that are not much longer are unstable, or miss an event: for other "
