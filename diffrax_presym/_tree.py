@@ -80,7 +80,7 @@ def scale(c: ArrayLike, y: PyTree) -> PyTree:
 
 
 @jax.custom_batching.custom_vmap
-def largest_member(x: Shaped[Array, ""]) -> Shaped[Array, ""]:
+def largest_member(x: Shaped[Array, "..."]) -> Shaped[Array, "..."]:
     """The largest among the members of a batch, the same for all of them."""
     return x
 
@@ -95,7 +95,7 @@ def smallest_member(x: Shaped[Array, ""]) -> Shaped[Array, ""]:
     return -largest_member(-x)
 
 
-def any_member(x: Bool[Array, ""]) -> Bool[Array, ""]:
+def any_member(x: Bool[Array, "..."]) -> Bool[Array, "..."]:
     """Whether it is true for any member of a batch, the same for all of them."""
     return largest_member(x)
 

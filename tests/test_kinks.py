@@ -286,3 +286,49 @@ def test_gradients_of_values_beside_a_jump(solver, above):
     if not isinstance(solver, dps.PresymplecticTao):  # whose copies start anew there
         # Between steps Diffrax's loop interpolates otherwise.
         np.testing.assert_allclose(found[3], found[0], rtol=1e-2)
+
+
+# Spans of one and two steps between others, at the ends and within.
+SHORT = np.array([[0.03, 2.0, 2.01, 2.18, 5.0], [3.0, 3.0, 3.05, 3.06, 5.95]])
+
+
+def test_only_values_in_spans_of_few_steps_are_shorter_steps():
+    y0, ts = Y0, np.linspace(0.0, 6.0, 181)
+    system = system_of(lambda t, q, args: cosine(t, q, None), 0.1)
+
+    def solve(y0, times):
+        sol: Any = dfx.diffeqsolve(
+            *(system, dps.BlanesMoanRKN6(), 0.0, 6.0, 0.1, y0),
+            stepsize_controller=dps.StepsBetween(times),
+            adjoint=dps.FixedStepAdjoint(),
+            saveat=dfx.SaveAt(ts=jnp.asarray(ts)),
+        )
+        weights = jnp.cos(jnp.arange(181.0))[:, None]
+        return sum(jnp.sum(weights * y**2) for y in sol.ys), (sol.ys, sol.stats)
+
+    both = jax.value_and_grad(solve, has_aux=True)
+    exact = [np.concatenate(y0)]
+    for first, last in itertools.pairwise(ts):
+        exact.append(by_scipy(first, last, exact[-1], *np.zeros((2, 1))))
+    slopes, both = [], jax.jit(both)
+    for times in SHORT:
+        (_, (ys, stats)), slope = both(y0, jnp.asarray(times))
+        values = np.concatenate(ys, axis=1)
+        assert np.max(np.abs(values - exact)) < 1e-10
+        # As many as there are in steps of 0.1 or more, but a few.
+        assert 170 <= stats["interpolated"] <= 181
+        slopes.append(flat(slope))
+    change = lambda side: both((y0[0] + side * 1e-5, y0[1]), jnp.asarray(SHORT[0]))[0][
+        0
+    ]
+    difference = float(change(1.0) - change(-1.0)) / 2e-5
+    size = len(np.ravel(y0[0]))
+    assert np.sum(slopes[0][:size]) == pytest.approx(difference, rel=1e-7)
+    # In a batch a value may be interpolated in some members alone.
+    batch = jnp.array([[1.0, 2.0, 3.0, 4.0, 5.0], *SHORT])
+    (_, (ys, _)), slope = jax.jit(jax.vmap(both, (None, 0)))(y0, batch)
+    for i, times in enumerate(batch):
+        (_, (alone, _)), one = both(y0, times)
+        np.testing.assert_allclose(ys[0][i], alone[0], rtol=1e-12, atol=1e-14)
+        of_member = flat(jax.tree.map(lambda x, i=i: x[i], slope))
+        np.testing.assert_allclose(of_member, flat(one), rtol=1e-10)

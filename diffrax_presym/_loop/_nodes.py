@@ -14,7 +14,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .. import _tree as tree
 from .._numbers import cast_to, rounding_of, State
@@ -129,8 +129,7 @@ def _rate(system: System, t: Array, y: State, h: Array) -> Float[Array, ""]:
 def first_node(system: System, steps: Steps, last: Array, y: State) -> Int[Array, ""]:
     """The step from whose start on values between steps are interpolated; before it
     they are shorter steps."""
-    yes = steps.fewest(last) >= NODES - 1
-    yes &= steps.ratio <= _MOST_RATIO
+    yes = steps.ratio <= _MOST_RATIO
     first = jnp.zeros((), int)
     if system.friction is not None:
         first = steps.weak_from(system, last)
@@ -150,11 +149,10 @@ class Stencils(eqx.Module):
     nodes: Float[Array, "rows nodes"] | None  # if they are not 0, 1, 2, 3
     weights: Float[Array, "rows nodes each"]
     number: Int[Array, ""]  # of values where a polynomial can follow the solution
-    # The first row that is interpolated; the earliest and the latest of these among the
-    # members of a batch.
-    begin: Int[Array, ""]
-    earliest: Int[Array, ""]
-    latest: Int[Array, ""]
+    own: Bool[Array, " rows"]  # those that are interpolated
+    earliest: Int[Array, ""]  # the first of them in any member of a batch
+    others: Int[Array, " rows+1"]  # some rows in order, with those that are not in any
+    latest: Int[Array, ""]  # from which row on all are interpolated
 
     def __init__(
         self, steps: Steps, rows: Rows, last: Array, first_node: Array, each: int
@@ -162,7 +160,8 @@ class Stencils(eqx.Module):
         stop = jnp.maximum(rows.stop, 0)
         begin = steps.time(stop)
         low, high = steps.smooth_part(stop)
-        first = jnp.minimum(stop - NODES // 2, jnp.minimum(high, last) - NODES) + 1
+        high = jnp.minimum(high, last)
+        first = jnp.minimum(stop - NODES // 2, high - NODES) + 1
         first = jnp.maximum(first, low)
         self.unit, self.nodes = steps.lengths(stop), None
         self.place = jnp.where(rows.inside, (rows.time - begin) / self.unit, 0)
@@ -173,15 +172,29 @@ class Stencils(eqx.Module):
             self.nodes = jnp.stack(nodes, axis=-1) / self.unit[:, None]
         self.weights = _weights(self.place, self.nodes, self.unit, each)
         number, due = len(rows), rows.reached(last)
+        few = high - low < NODES - 1  # steps in the span
         before = (rows.stop >= 0) & (first < first_node)
+        if steps.kinks is None:
+            before |= few
         begin = jnp.max(jnp.where(before, jnp.arange(number) + 1, 0), initial=0)
-        self.number = jnp.sum(rows.taken(last) & (jnp.arange(number) >= begin))
+        follows = (jnp.arange(number) >= begin) & ~few
+        self.number = jnp.sum(rows.taken(last) & follows)
         # Values at the ends of steps need no nodes, if they are the only ones.
-        self.begin = jnp.where(jnp.any(rows.inside), begin, number)
-        self.latest = tree.largest_member(self.begin)
-        self.earliest = tree.smallest_member(self.begin)
+        begin = jnp.where(jnp.any(rows.inside), begin, number)
+        self.own = follows & jnp.any(rows.inside)
+        self.latest = tree.largest_member(begin)
+        self.earliest = tree.smallest_member(begin)
+        self.others = jnp.arange(number + 1)
+        if steps.kinks is not None:
+            # Between them, rows of spans with more steps.
+            self.latest = jnp.full_like(self.latest, number)
+            (some,) = jnp.nonzero(
+                tree.any_member(~self.own), size=number, fill_value=number
+            )
+            self.others = jnp.append(some, number)
         # A gap in measured times is saved at once, whatever it is.
-        first = jnp.where(rows.stop < 0, -NODES, jnp.where(due, first, last + 1))
+        gap = (rows.stop < 0) | few
+        first = jnp.where(gap, -NODES, jnp.where(due, first, last + 1))
         self.first = jnp.append(first, last + 1)
 
     @property
@@ -195,8 +208,20 @@ class Stencils(eqx.Module):
 
     def known(self, rows: Rows) -> Int[Array, " rows"]:
         """The number of steps after which each row is known."""
-        here = (jnp.arange(len(rows)) >= self.begin) & (rows.stop >= 0)
+        here = self.own & (rows.stop >= 0)
         return jnp.where(here, self.last(slice(-1)), rows.known)
+
+    def stops(self, rows: Rows, last: Array) -> Int[Array, " rows+1"]:
+        """The steps from whose starts the others are shorter ones."""
+        due = jnp.append(rows.reached(last), False) & (
+            jnp.arange(len(rows) + 1) < self.latest
+        )
+        never = jnp.append(rows.stop, last + 1)
+        return jnp.where(due, never, last + 1)[self.others]
+
+    def others_before(self, row: Array) -> Int[Array, ""]:
+        """How many of the others are before a row."""
+        return jnp.sum(self.others < jnp.minimum(row, self.latest))
 
     def _row(self, j: Array) -> Float[Array, "nodes each"]:
         return _row_weights(j, self.weights, self.place, self.nodes, self.unit)

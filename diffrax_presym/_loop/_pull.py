@@ -27,7 +27,7 @@ def pulls(problem: Problem) -> list[AbstractPull]:
         if varies:
             tracks.append(PullTimed(i, rows.stop))
         elif len(rows):
-            tracks.append(PullRows(i, rows.stop))
+            tracks.append(PullRows(i, rows.stop, stencils))
         if stencils is not None:
             tracks.append(PullNodes(i, stencils))
     return tracks
@@ -37,23 +37,25 @@ class PullRows(AbstractPull):
     """Values at steps, or of shorter ones from there; the state is their number."""
 
     stops: Array
+    stencils: Stencils | None  # of those that are not interpolated
 
     def start(self, backward):
-        problem, i = backward.problem, self.i
-        number = problem.rows[i].first_left(backward.trace.n)
-        stencils = problem.stencils[i]
-        return number if stencils is None else jnp.minimum(number, stencils.latest)
+        row = backward.problem.rows[self.i].first_left(backward.trace.n)
+        return row if self.stencils is None else self.stencils.others_before(row)
+
+    def _row(self, state: Array) -> Array:
+        return state - 1 if self.stencils is None else self.stencils.others[state - 1]
 
     def due(self, state, n):
-        stop = self.stops[state - 1]
+        stop = self.stops[self._row(state)]
         return jnp.where(state > 0, jnp.where(stop < 0, n, stop), -1)
 
     def pull(self, backward, n, at, state):
-        j, problem = state - 1, backward.problem
-        taken = problem.rows[self.i].stop[j] >= 0
-        if (stencils := problem.stencils[self.i]) is not None:
-            taken &= j < stencils.begin
-        return _pull_row(backward, at, self.i, j, taken), j
+        j = self._row(state)
+        taken = backward.problem.rows[self.i].stop[j] >= 0
+        if self.stencils is not None:
+            taken &= ~self.stencils.own[j]
+        return _pull_row(backward, at, self.i, j, taken), state - 1
 
 
 def _pull_row(
@@ -106,11 +108,12 @@ class PullNodes(AbstractPull):
         def pull_row(x):
             gradient, low, j, bars = x
             j = j - 1
-            taken = (rows.stop[j] >= 0) & (j >= self.stencils.begin)
+            taken = (rows.stop[j] >= 0) & self.stencils.own[j]
             y = row_of(backward.trace.between[i], j)
             more, bar = _pull_value(backward, i, j, taken, y)
             bars = self.stencils.spread(j, n, bar, bars)
-            low = jnp.where(rows.stop[j] >= 0, self.stencils.first[j], low)
+            first = self.stencils.first[j]
+            low = jnp.where(first >= 0, first, low)
             return tree.add(gradient, more), low, j, bars
 
         def more_rows(x):

@@ -106,8 +106,6 @@ def _track(problem: Problem, i: int, keep: bool) -> AbstractTrack | None:
     y, output = problem.start[0], functions.outputs[i]
     init, due = output(problem.steps.t0, y), rows.reached(problem.last)
     saved = partial(problem.output, i, functions)
-    if stencils is not None:
-        due &= jnp.arange(len(rows)) < stencils.latest
     stops = stops_due(rows.stop, due, problem.last + 1)
     if not rows.has_times:
         init = problem.steps.t0, init, jnp.asarray(True)
@@ -129,6 +127,7 @@ def _track(problem: Problem, i: int, keep: bool) -> AbstractTrack | None:
     kept = lambda y: y if keep else None
     value = lambda row, y: (output(row.time, y), kept(y))
     init, about = (init, kept(y)), (problem.steps.kinks, rows.each)
+    stops = stencils.stops(rows, problem.last)
     return Between(stencils, stops, *about, step, functions.node, value, y, init)
 
 

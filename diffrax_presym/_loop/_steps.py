@@ -107,12 +107,6 @@ class Steps(AbstractSteps):
         t = self.starts[k] + self.length[k] * (n - self.first[k]).astype(self.t0.dtype)
         return jnp.where(n >= self.total, self.t1, t)
 
-    def fewest(self, last: Array) -> Int[Array, ""]:
-        """The least number of steps between two of the given times, up to the last."""
-        ends = jnp.append(self.first[1:], self.total)
-        counts = jnp.minimum(ends, last) - self.first
-        return jnp.min(jnp.where(counts > 0, counts, last))
-
     @property
     def ratio(self) -> Float[Array, ""]:
         """The largest ratio of neighbouring steps, unless steps may end between."""

@@ -79,7 +79,7 @@ class Track(AbstractTrack):
 class Collected(eqx.Module):
     """What has been collected of values between steps."""
 
-    shorter: Int[Array, ""]  # the next row that is a shorter step
+    shorter: Int[Array, ""]  # the next of the rows that are shorter steps
     node: Int[Array, ""]  # the next node, if there are rows left for which it is one
     interpolated: Int[Array, ""]  # the next row that is interpolated
     ring: Node  # the last nodes
@@ -104,8 +104,7 @@ class Between(AbstractTrack):
     def start(self):
         node, zero = stack(self.y, self.stencils.each), jnp.zeros((), int)
         rows = stack(self.init, len(self.stencils.first) - 1)
-        begin = self.stencils.earliest
-        ring = stack(node, NODES)
+        begin, ring = self.stencils.earliest, stack(node, NODES)
         return Collected(zero, zero, begin, ring, rows, jnp.asarray(True))
 
     def _due(self, state: Collected) -> tuple[Array, Array]:
@@ -117,7 +116,7 @@ class Between(AbstractTrack):
 
     def visit(self, state, n, point, here):
         shorter, own = (here & (due == n) for due in self._due(state))
-        row = row_of(self.about, state.shorter)
+        row = row_of(self.about, self.stencils.others[state.shorter])
         y = apart(n, shorter, lambda: self.step(row, point), self.y)
         save_step = lambda state: self._save_step(state, row, y, shorter)
         state = where_any(shorter, save_step, state)
@@ -132,13 +131,11 @@ class Between(AbstractTrack):
     def _save_step(
         self, state: Collected, row: PyTree, y: State, here: Array
     ) -> Collected:
-        j = state.shorter
+        j = self.stencils.others[state.shorter]
         # A member of a batch that interpolates it does so later.
         rows = put_here(state.rows, j, self.value(row, y), here)
-        finite = state.finite & (
-            ~here | (j >= self.stencils.begin) | tree.all_finite(y)
-        )
-        new = j + here.astype(j.dtype), rows, finite
+        finite = state.finite & (~here | self.stencils.own[j] | tree.all_finite(y))
+        new = state.shorter + here.astype(j.dtype), rows, finite
         return eqx.tree_at(lambda x: (x.shorter, x.rows, x.finite), state, new)
 
     def _visit_node(
@@ -158,8 +155,11 @@ class Between(AbstractTrack):
             j, rows = x
             done = complete(j)
             y = self.stencils.combine(j, n, ring)
-            own = done & (j >= self.stencils.begin)
+            own = done & self.stencils.own[j]
             value = self.value(row_of(self.about, j), y)
+            if self.kinks is not None:
+                # In a span of few steps it has been saved.
+                value = tree.where(self.stencils.own[j], value, row_of(rows, j))
             return j + done.astype(j.dtype), put_here(rows, j, value, own)
 
         more = lambda x: tree.any_member(complete(x[0]))
