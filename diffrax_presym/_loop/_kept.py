@@ -13,7 +13,8 @@ from .. import _tree as tree
 from .._scheme._base import Point
 from ._backward import Backward, BackwardState
 from ._problem import Problem
-from ._tracks import AbstractTrack, stops_due, Track
+from ._rows import stops_due
+from ._tracks import AbstractTrack, Track
 from ._variable import Kept
 
 

@@ -21,7 +21,7 @@ from .._numbers import cast_to, rounding_of, State
 from .._scheme._base import Point, Scheme
 from .._system._bound import System
 from ._base import MOST_FRICTION, MOST_STEPS
-from ._rows import Rows
+from ._rows import Rows, stops_due
 from ._steps import Steps
 
 
@@ -149,10 +149,11 @@ class Stencils(eqx.Module):
     nodes: Float[Array, "rows nodes"] | None  # if they are not 0, 1, 2, 3
     weights: Float[Array, "rows nodes each"]
     number: Int[Array, ""]  # of values where a polynomial can follow the solution
-    own: Bool[Array, " rows"]  # those that are interpolated
+    own: Bool[Array, " rows"]  # which are interpolated
     earliest: Int[Array, ""]  # the first of them in any member of a batch
-    others: Int[Array, " rows+1"]  # some rows in order, with those that are not in any
-    latest: Int[Array, ""]  # from which row on all are interpolated
+    # Rows in order, of which those before the latest are not interpolated in a member.
+    others: Int[Array, " rows+1"]
+    latest: Int[Array, ""]
 
     def __init__(
         self, steps: Steps, rows: Rows, last: Array, first_node: Array, each: int
@@ -186,11 +187,10 @@ class Stencils(eqx.Module):
         self.earliest = tree.smallest_member(begin)
         self.others = jnp.arange(number + 1)
         if steps.kinks is not None:
-            # Between them, rows of spans with more steps.
+            # Spans of few steps may be between others.
             self.latest = jnp.full_like(self.latest, number)
-            (some,) = jnp.nonzero(
-                tree.any_member(~self.own), size=number, fill_value=number
-            )
+            some = tree.any_member(~self.own)
+            (some,) = jnp.nonzero(some, size=number, fill_value=number)
             self.others = jnp.append(some, number)
         # A gap in measured times is saved at once, whatever it is.
         gap = (rows.stop < 0) | few
@@ -213,11 +213,8 @@ class Stencils(eqx.Module):
 
     def stops(self, rows: Rows, last: Array) -> Int[Array, " rows+1"]:
         """The steps from whose starts the others are shorter ones."""
-        due = jnp.append(rows.reached(last), False) & (
-            jnp.arange(len(rows) + 1) < self.latest
-        )
-        never = jnp.append(rows.stop, last + 1)
-        return jnp.where(due, never, last + 1)[self.others]
+        due = rows.reached(last) & (jnp.arange(len(rows)) < self.latest)
+        return stops_due(rows.stop, due, last + 1)[self.others]
 
     def others_before(self, row: Array) -> Int[Array, ""]:
         """How many of the others are before a row."""

@@ -19,6 +19,13 @@ class Row(NamedTuple):
     inside: Bool[Array, "..."]
 
 
+def stops_due(
+    stops: Int[Array, " rows"], due: Bool[Array, " rows"], never: Array
+) -> Int[Array, " rows+1"]:
+    """Those of the first rows, which are due, and then one that is never reached."""
+    return jnp.append(jnp.where(due, stops, never), never)
+
+
 class Rows(eqx.Module):
     """What one of `SaveAt(subs=...)` saves between the ends of a solve, in order."""
 

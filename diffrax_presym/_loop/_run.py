@@ -23,8 +23,8 @@ from .._scheme._base import Point
 from .._scheme._engine import cheap_iterations
 from ._base import MOST_STEPS, Stop
 from ._problem import Problem
-from ._rows import Row, Rows
-from ._tracks import AbstractTrack, Between, put, stops_due, Track
+from ._rows import Row, Rows, stops_due
+from ._tracks import AbstractTrack, Between, put, Track
 from ._variable import VariableSteps
 from ._within import Timed
 

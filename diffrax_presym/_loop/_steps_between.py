@@ -76,7 +76,7 @@ class StepsBetween(dfx.AbstractStepSizeController):
         first = jnp.ones((), int)
         return self._end(steps, first), (first, steps)
 
-    def _end(self, steps: "Steps", n: Array) -> Array:
+    def _end(self, steps: Steps, n: Array) -> Array:
         """That of a step before step `n`, in Diffrax's loop before a kink."""
         kink = jnp.any(steps.kinks == n) & (n < steps.total)
         return jnp.where(kink, eqxi.prevbefore(steps.time(n)), steps.time(n))

@@ -182,13 +182,6 @@ def row_of(x: _T, j: Array) -> _T:
     return jtu.tree_map(lambda x: x[j], x)
 
 
-def stops_due(
-    stops: Int[Array, " rows"], due: Bool[Array, " rows"], never: Array
-) -> Int[Array, " rows+1"]:
-    """Those of the first rows, which are due, and then one that is never reached."""
-    return jnp.append(jnp.where(due, stops, never), never)
-
-
 def where_any(here: Bool[Array, ""], visit: Callable[[_T], _T], state: _T) -> _T:
     """`visit(state)`, if any member of a batch is `here`: they are asked together, as
     JAX would otherwise copy all that was collected."""
