@@ -122,7 +122,9 @@ def test_never_across_a_kink():
 
     sol = run(TS, 0.5)
     assert sol.stats["interpolated"]
-    assert not run(TS, 4.0).stats["interpolated"]  # steps are too few
+    # Spans of two, two and three steps, and of one, one and two: too few.
+    assert run(TS, 4.0).stats["interpolated"] == np.sum(TS > knots[2])
+    assert not run(TS, 6.0).stats["interpolated"]
     fine = run(TS, T1 / 1600)
     assert np.stack(sol.ys) == pytest.approx(np.stack(fine.ys), abs=1e-9)
 
