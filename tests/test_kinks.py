@@ -174,6 +174,7 @@ ORDERS = [
     (dps.PresymplecticLeapfrog("position"), 1.8, np.inf),
     (RKN6, 5, np.inf),
     (RKN4, 3.5, np.inf),
+    (dps.Strang(), 1.8, np.inf),
     (dps.Suzuki4(dps.Strang()), 3.5, np.inf),
     (dps.PresymplecticLeapfrog(), 1.8, np.inf),
     (dps.PresymplecticTao(3.0), 1.8, np.inf),
@@ -199,6 +200,25 @@ def test_steps_that_end_where_a_force_jumps(solver, least, most):
     ends = [np.concatenate([x[-1] for x in solve(h).ys]) for h in (0.3, 0.15)]
     first, second = (np.max(np.abs(end - y)) for end in ends)
     assert least < np.log2(first / second) < most
+
+
+LAWS = None, lambda t: 0.1 + 0.05 * jnp.sin(t), dps.ViscousDamping(np.eye(2) + 0.3)
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("solver", [solver for solver, *_ in ORDERS])
+def test_times_at_which_steps_end_anyway_change_nothing(solver, law):
+    system, found = dps.MechanicalSystem(dps.QuadraticKinetic(), cosine, law), []
+    for options in ({}, {"stepsize_controller": dps.StepsBetween(jnp.arange(1.0, 3))}):
+
+        def end(y0, options=options):
+            args: Any = system, solver, 0.0, 3.0, 0.1, y0
+            adjoint = dps.FixedStepAdjoint(checkpoints=4)
+            sol: Any = dfx.diffeqsolve(*args, adjoint=adjoint, **options)
+            return jnp.sum(jnp.cos(sol.ys[0]) * sol.ys[1]), sol.ys
+
+        found.append(flat(jax.jit(jax.value_and_grad(end, has_aux=True))(Y0)))
+    np.testing.assert_allclose(*found, rtol=1e-10)
 
 
 # To this function of time the time before a jump is after it.
@@ -274,8 +294,7 @@ def test_gradients_of_values_beside_a_jump(solver, above):
         weights = jnp.cos(jnp.arange(24.0))[:, None]
         return sum(jnp.sum(weights * y**2) for y in sol.ys)
 
-    own = [("reversal", 2), ("reversal", None), ("checkpoints", 3)]
-    found = []
+    own, found = [("reversal", 2), ("reversal", None), ("checkpoints", 3)], []
     for adjoint in (*(dps.FixedStepAdjoint(*x) for x in own), dfx.DirectAdjoint()):
         slopes = jax.jit(jax.grad(partial(loss, adjoint=adjoint), (0, 1)))
         found.append(flat(slopes(0.8, Y0)))
@@ -306,11 +325,10 @@ def test_only_values_in_spans_of_few_steps_are_shorter_steps():
         weights = jnp.cos(jnp.arange(181.0))[:, None]
         return sum(jnp.sum(weights * y**2) for y in sol.ys), (sol.ys, sol.stats)
 
-    both = jax.value_and_grad(solve, has_aux=True)
     exact = [np.concatenate(y0)]
     for first, last in itertools.pairwise(ts):
         exact.append(by_scipy(first, last, exact[-1], *np.zeros((2, 1))))
-    slopes, both = [], jax.jit(both)
+    slopes, both = [], jax.jit(jax.value_and_grad(solve, has_aux=True))
     for times in SHORT:
         (_, (ys, stats)), slope = both(y0, jnp.asarray(times))
         values = np.concatenate(ys, axis=1)
@@ -318,10 +336,8 @@ def test_only_values_in_spans_of_few_steps_are_shorter_steps():
         # As many as there are in steps of 0.1 or more, but a few.
         assert 170 <= stats["interpolated"] <= 181
         slopes.append(flat(slope))
-    change = lambda side: both((y0[0] + side * 1e-5, y0[1]), jnp.asarray(SHORT[0]))[0][
-        0
-    ]
-    difference = float(change(1.0) - change(-1.0)) / 2e-5
+    value = lambda q: float(both((q, y0[1]), jnp.asarray(SHORT[0]))[0][0])
+    difference = (value(y0[0] + 1e-5) - value(y0[0] - 1e-5)) / 2e-5
     size = len(np.ravel(y0[0]))
     assert np.sum(slopes[0][:size]) == pytest.approx(difference, rel=1e-7)
     # In a batch a value may be interpolated in some members alone.

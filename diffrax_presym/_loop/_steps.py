@@ -96,6 +96,14 @@ class Steps(AbstractSteps):
             return 0
         return jnp.searchsorted(self.first, n, side="right").astype(int) - 1
 
+    def _starts(self, n: Int[Array, ""], k: Any) -> Bool[Array, ""]:
+        """Whether step `n` is the first of span `k`, which follows another."""
+        return (n == self.first[k]) & (n > 0)
+
+    def is_kink(self, n: Int[Array, ""]) -> Bool[Array, ""]:
+        """Whether step `n` starts at one of the given times."""
+        return self._starts(n, self._part(n))
+
     def time(self, n: Int[Array, "..."]) -> Float[Array, "..."]:
         """The start of step `n`."""
         if self.ts is not None:
@@ -165,8 +173,8 @@ class Steps(AbstractSteps):
             t1 = jnp.where(last, self.starts[after], t1)
             span = Span(*map(system.time, (t0, t1, self.length[k])))
             # Beside a kink on their side of it.
-            kink, other = (n == self.first[k]) & (n > 0), span.rounding
-            t0 = span.t0 + jnp.where(kink, other, 0)
+            other = span.rounding
+            t0 = span.t0 + jnp.where(self._starts(n, k), other, 0)
             return span._replace(t0=t0, t1=span.t1 - jnp.where(last, other, 0))
         return Span(*map(system.time, (t0, t1, self.length[k])))
 
@@ -177,7 +185,8 @@ class Steps(AbstractSteps):
         y, carry = point
         if self.kinks is None or scheme.at_kink is None:
             return point
-        kink, new = (n == self.first[self._part(n)]) & (n > 0), scheme.at_kink
+        new = scheme.at_kink
+        kink = self.is_kink(n)
         return y, lax.cond(kink, lambda: new(system, t, y, carry), lambda: carry)
 
     def begin(self, n, point):

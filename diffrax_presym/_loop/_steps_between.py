@@ -78,16 +78,15 @@ class StepsBetween(dfx.AbstractStepSizeController):
 
     def _end(self, steps: Steps, n: Array) -> Array:
         """That of a step before step `n`, in Diffrax's loop before a kink."""
-        kink = jnp.any(steps.kinks == n) & (n < steps.total)
+        kink = steps.is_kink(n) & (n < steps.total)
         return jnp.where(kink, eqxi.prevbefore(steps.time(n)), steps.time(n))
 
     def adapt_step_size(
         self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
     ):
         n, steps = controller_state
-        kink, state = jnp.any(steps.kinks == n), (n + 1, steps)
-        times = steps.time(n), self._end(steps, n + 1)
-        return True, *times, kink, state, dfx.RESULTS.successful
+        times, state = (steps.time(n), self._end(steps, n + 1)), (n + 1, steps)
+        return True, *times, steps.is_kink(n), state, dfx.RESULTS.successful
 
 
 def known_steps(controller: dfx.AbstractStepSizeController, t0, t1, dt0) -> Steps:

@@ -122,7 +122,7 @@ class AbstractPresymplecticSolver(dfx.AbstractSolver):
         t0, t1 = system.time(t0), system.time(t1)
         scheme, span = self.scheme(system), Span(t0, t1, t1 - t0)
         if made_jump is not False:
-            # To a function of time this may still be the time before it.
+            # To a function of time `t0` may still be before the jump.
             span = span._replace(t0=t0 + jnp.where(made_jump, span.rounding, 0))
         restart = lambda: scheme.start(system, span.t0, y0)
         carry = solver_state
