@@ -36,8 +36,12 @@ def possible(row: dict) -> bool:
         return False
     if way is not None and way.backwards and friction.limit is not None:
         return False
-    if way is not None and way.name == "step density" and "multistep" in scheme.name:
+    jumps = "system" in row and row["system"].jumps
+    uneven = way is not None and (way.name == "step density" or way.between)
+    if (jumps or uneven) and "multistep" in scheme.name:
         return False  # its history is of equal steps
+    if jumps and way is not None and not way.between:
+        return False  # a step across a jump is of order one
     if way is not None and way.name == "HalfSolver" and scheme.name == "Tao":
         return False  # its docstring says why
     if row.get("precision") == "float32" and friction.double:

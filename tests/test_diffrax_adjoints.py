@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 import diffrax_presym as dps
 
 
-NONE, *LAWS = [x for x in catalogue.FRICTION if x.limit is None and x.kink is None]
+NONE, *LAWS = [x for x in catalogue.FRICTION if x.limit is None and not x.jumps]
 (BODIES,) = catalogue.named(catalogue.SYSTEMS, "bodies")
 # Without those that collocation would leave the manifold of.
 PAIRS = [(s, NONE) for s in catalogue.SYSTEMS if not s.constrained]

@@ -17,8 +17,8 @@ import numpy as np
 import scipy.integrate
 from jax.flatten_util import ravel_pytree
 
-from ._system import ANY, System
-from .friction import FRICTION, Friction, LENGTH
+from ._system import ANY, JUMP, LENGTH, System
+from .friction import FRICTION, Friction
 from .schemes import each, PATHS, pick, Scheme, SCHEMES, STATES, Wrapper, WRAPPERS
 from .systems import SYSTEMS
 from .ways import GRADIENTS, Problem, WAYS
@@ -35,7 +35,7 @@ PRECISIONS = ["float64", "float32"]
 # What is exported and not combined here, and the file of tests that has it.
 ELSEWHERE = {
     "StepDensityController",  # step_density
-    *("ChosenStep", "FixedStepAdjoint", "StepsBetween"),  # choose_step, adjoint
+    *("ChosenStep", "FixedStepAdjoint"),  # choose_step, adjoint
     "Stiefel",  # manifolds
     "MirrorMap",  # bregman
     *("Splitting", "SplittingTableau"),  # tableaus
@@ -84,9 +84,9 @@ def offered(system: System, friction: Friction) -> frozenset[str] | Refused:
         return Refused("not one vector")
     if friction.needs == "bodies" and not system.bodies:
         return frozenset()  # without a closed form, it is a force
-    if kind == "force" and system.takes == "rates":
-        return frozenset()
     in_kicks = kind in ("force", "place", "drag")
+    if in_kicks and system.takes == "rates":
+        return frozenset()  # a split of a user has no such kicks
     if in_kicks or (system.constrained and kind != "one rate"):
         return system.offers & ANY
     constant = friction.constant and kind == "one rate"
@@ -111,7 +111,7 @@ def claim(
         order = wrapper.order
     if friction.kind == "drag" and system.size == 1:
         return min(order, 2)  # |v| v has a kink where the body turns
-    if friction.kink is not None and not (scheme.inside and wrapper.inside):
+    if friction.jumps and not (scheme.inside and wrapper.inside):
         return min(order, 2)  # stages go beyond the ends of a step
     if friction.limit is None:
         return order
@@ -145,7 +145,8 @@ def reference(system: System, friction: Friction):
             force = system.react(t, q, p, force)
         return np.concatenate([v, force])
 
-    ends = [t0, *([] if friction.kink is None else [friction.kink]), t1]
+    jumps = system.jumps or friction.jumps
+    ends = [t0, *([JUMP] if jumps else []), t1]
     pieces, y = [], ravel_pytree(start(system, friction))[0]
     for a, b in itertools.pairwise(ends):
         solution = scipy.integrate.solve_ivp(

@@ -11,6 +11,8 @@ import diffrax_presym as dps
 
 
 START = 0.25  # of all solves, but for those from a singularity
+LENGTH = 1.5  # of all solves. Steps are exact in binary.
+JUMP = START + LENGTH / 2  # where a force or a rate has one
 
 SPLIT = frozenset({"separable", "any"})
 ALL = SPLIT | {"nystrom"}
@@ -40,6 +42,7 @@ class System:
     start: float = START
     constrained: bool = False  # whether its states are on a manifold
     slow: bool = False  # whether schemes of many stages take minutes to compile
+    jumps: bool = False  # whether its force or velocity does, at `JUMP`
     # Where there are multipliers: the force with theirs, of t, q, p and that without.
     react: Callable | None = None
 

@@ -14,10 +14,7 @@ from jax.flatten_util import ravel_pytree
 
 import diffrax_presym as dps
 
-from ._system import START, System
-
-
-LENGTH = 1.5  # of all solves. Steps are exact in binary.
+from ._system import JUMP, System
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -37,7 +34,7 @@ class Friction:
     # its friction.
     left: Callable[[System], float] = lambda s: np.inf
     limit: Callable | None = None
-    kink: float | None = None
+    jumps: bool = False  # whether its rate does, at `JUMP`
 
     def __repr__(self):
         return self.name
@@ -127,11 +124,8 @@ def _wave(t):
     return 0.1 * t + 0.2 * jnp.sin(t)
 
 
-_KINK = START + LENGTH / 2
-
-
 def _jump(t):
-    return 0.5 * jnp.maximum(t - _KINK, 0)
+    return 0.5 * jnp.maximum(t - JUMP, 0)
 
 
 def _viscous(system, skew=False):
@@ -223,10 +217,10 @@ FRICTION = [
         constant=False,
     ),
     _rate(
-        *("rate that jumps", (_jump,), lambda t: 0.5 * (t > _KINK)),
-        lambda t: 0.5 * max(t - _KINK, 0),
+        *("rate that jumps", (_jump,), lambda t: 0.5 * (t > JUMP)),
+        lambda t: 0.5 * max(t - JUMP, 0),
         constant=False,
-        kink=_KINK,
+        jumps=True,
     ),
     _from_rest("3 / t", [_three], 3.0),
     _from_rest("1.5 / t", [dps.LogDamping(1.5)], 1.5),

@@ -7,6 +7,7 @@ import own
 
 import diffrax_presym as dps
 
+from ._jumping import JUMPING
 from ._manifolds import MANIFOLDS
 from ._system import (
     ALL,
@@ -290,5 +291,6 @@ SYSTEMS = [
         offers=frozenset({"any", "nystrom"}),
         takes="rates",
     ),
+    *JUMPING,
     *MANIFOLDS,
 ]

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import diffrax as dfx
@@ -10,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import diffrax_presym as dps
+
+from ._system import JUMP
 
 
 IRREGULAR = np.array([0.0, 0.04, 0.31, 0.3101, 0.77, 0.9, 1.0])  # of the span
@@ -26,6 +29,7 @@ class Way:
     run: Callable
     own: bool = True  # whether it uses the loop of the package
     prescribed: bool = False
+    between: bool = False  # whether steps end at `JUMP`, which is said
     equal: bool = True  # whether all steps have one length
     end: bool = True  # whether the last of what it returns is the end of the solve
     order: bool = (
@@ -92,6 +96,21 @@ def _unequal(problem, n, y0):
     ts = ts.at[-1].set(problem.t1)
     controller, saveat = dfx.StepTo(ts=ts), dfx.SaveAt(ts=problem.times(IRREGULAR))
     sol = problem.solve(None, y0, saveat, stepsize_controller=controller)
+    return [(sol.ts, sol.ys)], sol.result
+
+
+def _between(problem, n, y0, backwards=False):
+    """With spans of one step, and of two or so, beside the others."""
+    times = jnp.asarray([1.25, JUMP + 0.004, JUMP], jnp.result_type(problem.t0))
+    ends = (problem.t1, problem.t0) if backwards else (problem.t0, problem.t1)
+    sol = problem.solve(
+        -problem.length(n) if backwards else problem.length(n),
+        y0,
+        dfx.SaveAt(ts=problem.times(IRREGULAR)[:: -1 if backwards else 1], t1=True),
+        t0=ends[0],
+        t1=ends[1],
+        stepsize_controller=dps.StepsBetween(times),
+    )
     return [(sol.ts, sol.ys)], sol.result
 
 
@@ -187,11 +206,17 @@ WAYS = [
     Way("Diffrax's loop, chunks", _chunks, own=False),
     Way("HalfSolver", _adaptive, own=False, equal=False, order=False),
     Way("Diffrax's loop, density", _step_density(_last), own=False, equal=False),
+    Way("Diffrax's loop, between", _between, own=False, between=True, equal=False),
     Way("end", _at_end),
     Way("every second step", _saved(lambda _: dfx.SaveAt(steps=2)), end=False),
     Way("times", _at_times),
     Way("everything", _everything),
     Way("unequal steps", _unequal, prescribed=True, equal=False),
+    Way("between", _between, between=True, equal=False),
+    Way(
+        *("between, backwards", partial(_between, backwards=True)),
+        **{"between": True, "equal": False, "end": False, "backwards": True},
+    ),
     Way("step density", _step_density(_times_and_steps), equal=False),
     Way("chunks", _chunks),
     Way("backwards", _backwards, end=False, backwards=True),
