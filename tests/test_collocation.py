@@ -294,6 +294,21 @@ def test_gradients_and_reversal_of_strong_friction(coupled):
         assert x[-1] == pytest.approx(np.asarray(y), rel=1e-11)
 
 
+@pytest.mark.parametrize("strength", [0.1, 2.0])
+@pytest.mark.parametrize(
+    "wrap", [dps.Suzuki4, lambda x: dps.SofroniouSpaletta(6, dps.Compensated(x))]
+)
+def test_compositions_with_friction_by_a_function_of_time(wrap, strength):
+    """The same as by the class for this friction, also where it is not in frames."""
+    constant, _ = damped(strength, 0.25, coupled=False)
+    eta = lambda t: strength / 0.25 * t
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(), harmonic, eta)
+    solver = wrap(dps.PresymplecticGauss(1))
+    both = [solve(x, solver, 0.0, 2.0, 0.25, Y0).ys for x in (system, constant)]
+    for x, y in zip(*both, strict=True):
+        assert x == pytest.approx(np.asarray(y), rel=1e-10)
+
+
 @pytest.mark.parametrize("start", [0.0, 1e-3, 0.05])
 @pytest.mark.parametrize("stages", [1, 2, 4])
 def test_friction_after_a_singularity_is_in_the_frame(stages, start):

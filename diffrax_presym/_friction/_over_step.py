@@ -58,6 +58,13 @@ class FrictionOverStep(eqx.Module):
         # Of so much friction that rounding matters no polynomial is right to rounding.
         return jnp.zeros_like(as_time(h))
 
+    def strength(self, t: Time, h: Time) -> Scalar:
+        return self.exact.strength(t, h)
+
+    def scaled(self, factor: Scalar) -> EntryFriction:
+        # Another decay, which is no multiple of this.
+        return self.exact.scaled(factor)
+
     @property
     def converged(self) -> Bool[Array, ""]:
         """Whether the polynomials are right to rounding: whether further coefficients
