@@ -117,7 +117,8 @@ def scalar_fn(fn, name: str):
 
 
 def match(value: PyTree, like: PyTree, name: str, like_name: str) -> PyTree:
-    """A user's velocity or force, broadcast and cast to the leaves of the state."""
+    """A user's velocity or force, cast to the leaves of the state, of whose shapes it
+    must be: one of fewer axes may be meant for other entries than it would reach."""
     if jtu.tree_structure(value) != jtu.tree_structure(like):
         raise ValueError(
             f"{name} must return a pytree of the same structure as {like_name}, "
@@ -131,12 +132,12 @@ def match(value: PyTree, like: PyTree, name: str, like_name: str) -> PyTree:
                 f"{name} must return real arrays, but returned {describe(v)}. Use "
                 "`jnp.real` if the real part is meant."
             )
-        try:
-            return jnp.broadcast_to(cast_to(v, x), jnp.shape(x))
-        except ValueError as e:
-            raise ValueError(
-                f"{name} must return arrays of the shapes of {like_name}, but returned "
-                f"shape {jnp.shape(v)} for a leaf of shape {jnp.shape(x)}."
-            ) from e
+        if jnp.shape(v) == jnp.shape(x):
+            return cast_to(v, x)
+        raise ValueError(
+            f"{name} must return arrays of the shapes of {like_name}, but returned "
+            f"shape {jnp.shape(v)} for a leaf of shape {jnp.shape(x)}. If one value is "
+            f"meant for all entries, write `jnp.full_like`."
+        )
 
     return jtu.tree_map(leaf, value, like)

@@ -32,10 +32,8 @@ VECTOR, PLACES = jnp.array([0.1, 0.2]), jnp.ones((3, 2))
 ASYMMETRIC = jnp.array([[1.0, 0.5], [0.0, 1.0]])
 IS_SYMMETRIC, PART = "must be a symmetric matrix", "`(A + A.T) / 2`"
 V_OF_Q = "`potential` must be a function `V(t, q, args)`"
-SHAPE, STRUCTURE = (
-    ("returned shape (3,)", "of shape (2,)"),
-    "the same structure as the velocity",
-)
+SHAPE = "returned shape (3,)", "of shape (2,)"
+STRUCTURE = "the same structure as the velocity"
 LONG = lambda t, q, v, args: jnp.ones(3)
 TAO, GAUSS = dps.PresymplecticTao(), dps.PresymplecticGauss(2)
 
@@ -129,8 +127,13 @@ HAMILTONIANS = {
     "energy is no function": (lambda: dps.Hamiltonian(3.0), "got 3.0",
         "`energy` must be a function", "`E(t, q, p, args)`"),
     "force is no function": (lambda: mechanics(force=1.0), "f(t, q, v, args"),
-    "force of a wrong shape": (traced(GAUSS, force=LONG),
-        *SHAPE, "arrays of the shapes of the velocity"),
+    **{
+        f"{name} of shape {shape}": (
+            traced(GAUSS, **{name: kind(lambda *_, s=shape: jnp.ones(s))}),
+            *(f"returned shape {shape}", SHAPE[1]), "`force` must", "`jnp.full_like`")
+        for shape in ((), (1,), (1, 2), (3,))
+        for name, kind in (("force", lambda f: f), ("potential", dps.ForceField))
+    },
     "force of a wrong structure": (traced(GAUSS, force=lambda t, q, v, args: (q, q)),
         "returned PyTreeDef((*, *))", STRUCTURE, "`force`"),
     "complex force": (traced(GAUSS, force=lambda t, q, v, args: q * jnp.array(1j)),
@@ -138,9 +141,6 @@ HAMILTONIANS = {
     "force of an energy that is not separable": (
         lambda: trace(dps.Hamiltonian(mixed_energy, force=LONG), TAO),
         *SHAPE, "`force` must return"),
-    "force of a hand-written field": (
-        traced(potential=dps.ForceField(lambda t, q, args: jnp.ones(3))), *SHAPE,
-        "`force` must return"),
     "damping by a number": (lambda: mechanics(friction=0.2), "got 0.2", LAW, RATE),
     **{
         f"damping of the paper's family, {name}": (
