@@ -14,6 +14,7 @@ from diffrax_presym._loop._steps import Steps
 
 
 OWN = dps.FixedStepAdjoint()
+SPLIT = dps.StepsBetween(-jnp.ones(1))
 PENDULUM = dps.MechanicalSystem(
     dps.QuadraticKinetic(),
     lambda t, q, args: -jnp.sum(jnp.cos(q)),
@@ -95,6 +96,19 @@ def test_a_step_that_is_no_step(dt0):
         assert solve(jnp.asarray(dt0)).result != dfx.RESULTS.successful
     except RuntimeError as error:
         assert "dt0" in str(error)
+
+
+@pytest.mark.parametrize("saveat", [{"t1": True}, {"ts": jnp.linspace(-1.0, 0.0, 5)}])
+@pytest.mark.parametrize("controller", [dfx.ConstantStepSize(), SPLIT])
+def test_no_solve_from_a_time_that_is_not_finite(saveat, controller):
+    sol: Any = dfx.diffeqsolve(
+        dps.MechanicalSystem(dps.QuadraticKinetic(), lambda t, q, args: q @ q),
+        *(dps.BlanesMoanRKN4(), -jnp.inf, 0.0, 0.1, (jnp.ones(2), jnp.zeros(2))),
+        **{"max_steps": None, "throw": False, "adjoint": dps.FixedStepAdjoint()},
+        **{"saveat": dfx.SaveAt(**saveat), "stepsize_controller": controller},
+    )
+    assert sol.result == dfx.RESULTS.nonfinite  # pyright: ignore
+    assert sol.stats["num_steps"] == 0
 
 
 def test_times_in_a_list_are_an_error():

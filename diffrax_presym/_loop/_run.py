@@ -63,7 +63,8 @@ def run(problem: Problem, kept: AbstractTrack | None = None):
     end, n, (stacked, kept_states) = _run_steps(problem, (tracks, kept))
     progress = eqx.tree_at(lambda x: x.n, end, n)
 
-    saved, between, finite = [], [], tree.all_finite(progress.point[0])
+    saved, between = [], []
+    finite = tree.all_finite((progress.point[0], problem.steps.t0))
     all_rows, interpolated = [], problem.number_interpolated
     for i, collected in enumerate(stacked):
         values, ys, rows = None, None, problem.rows[i]

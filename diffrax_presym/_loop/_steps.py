@@ -74,7 +74,9 @@ class Steps(AbstractSteps):
         several = jnp.where(finite, jnp.maximum(numbers, 1), 1)
         self.length = jnp.where(finite, spans / several, dt0)
         last = counts if len(counts) == 1 else jnp.cumsum(counts)
-        self.first, self.count = last - counts, last[-1]
+        # No step begins at a time that is not finite.
+        self.count = jnp.where(jnp.isfinite(t0), last[-1], 0)
+        self.first = last - counts
 
     @property
     def total(self):
