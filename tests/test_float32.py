@@ -10,6 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 import pytest
 from catalogue import each, PATHS, pick, Scheme, STATES
+from choosing import RKN6, solve_of, system_of
 from helpers import harmonic, mixed_energy, solve
 
 import diffrax_presym as dps
@@ -67,6 +68,18 @@ def test_values_between_steps_at_late_times():
     # Times are multiples of 2^-7 there.
     t = np.asarray(ts, float) - 1e5
     assert np.asarray(sol.ys[0][:, 0]) == pytest.approx(np.cos(t), abs=0.01)
+
+
+@pytest.mark.parametrize("atol", [1e-3, 1e-4])
+def test_a_step_chosen_where_more_steps_add_rounding_alone(atol):
+    """The fewest that reach the tolerance, as in double precision."""
+    single = lambda x: jnp.asarray(x, jnp.float32)
+    q0, t0 = single(np.linspace(1.0, 15.0, 8)), float(np.float32(np.log(0.02)))
+    system = system_of(lambda t, q, args: -jnp.sum(jnp.cos(q)), single(0.5))
+    ts = single(np.log(np.linspace(0.1, 1.0, 10)))
+    solve = solve_of(system, RKN6, single(t0), single(0.0), (q0, 0 * q0), ts=ts)
+    cast = lambda dt0: solve(single(dt0))
+    assert dps.choose_step(cast, t0, 0.0, rtol=0.0, atol=atol).steps <= 3
 
 
 # The outputs of a step have the precision of the state. `diffeqsolve` would silently

@@ -82,9 +82,10 @@ class Law(NamedTuple):
 
     @property
     def agrees(self) -> bool:
-        """Whether three solves do: to rounding, or exactly."""
-        two = self.ladder[-2:]
-        return two[0].steps >= SEEING and max(x.error for x in two) <= 0.5
+        """Whether four solves do: to rounding, or exactly."""
+        three = self.ladder[-3:]
+        seen = len(three) == 3 and three[-1].steps >= SEEING
+        return seen and max(x.error for x in three) <= 0.5
 
     def difference(self, solution: Solution) -> float:
         if not (solution.finite and self.finest.finite):
@@ -211,6 +212,12 @@ def _smallest(law: Law, high: Trial, grid: Grid, measure) -> Trial:
     too_few = [x for x in law.ladder[:-1] if x.error > 1]
     low = too_few[-1] if too_few else Trial(0, math.inf, 0)
     steepest, failed = 1.5 * (law.claimed or 20), False
+    # The first that sufficed: those after it may differ by rounding alone.
+    first = next(x.number for x in law.ladder if x.number > low.number)
+    first = int(grid.cheaper(np.array([first]))[0])
+    if first < high.number:
+        trial = measure(first)
+        low, high = (trial, high) if trial.error > 1 else (low, trial)
     for _ in range(6):
         between = np.linspace(low.number + 1, high.number - 1, _CANDIDATES).astype(int)
         numbers = np.unique(grid.cheaper(between))
