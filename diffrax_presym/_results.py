@@ -21,6 +21,12 @@ def _entry(name: str, message: str) -> Any:
     return results._name_to_item[name]
 
 
+def is_of_failed_solve(text: str) -> bool:
+    """Whether that of an error is one of the reasons for which a solve fails."""
+    results: Any = dfx.RESULTS
+    return any(reason and reason in text for reason in results._index_to_message)
+
+
 SUCCESSFUL: Any = dfx.RESULTS.successful
 NONFINITE: Any = dfx.RESULTS.nonfinite  # pyright: ignore[reportAttributeAccessIssue]
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
+from choosing import PENDULUM, RKN6, solve_of, Y0
 from helpers import check_members
 
 import diffrax_presym as dps
@@ -272,6 +273,14 @@ def test_second_derivatives_of_a_batch_by_its_friction():
     got = jax.jit(jax.vmap(second))(ks)
     wanted = [(slope(k + h) - slope(k - h)) / (2 * h) for k in ks]
     np.testing.assert_allclose(got, wanted, rtol=1e-5)
+
+
+@pytest.mark.parametrize("jit", [lambda fn: fn, jax.jit])
+@pytest.mark.parametrize("ts, message", [([0.5, 1.1], "lie bet"), ([1.0, 0.5], "incr")])
+def test_an_error_of_a_solve_is_not_a_step_that_is_too_long(jit, ts, message):
+    solve = solve_of(PENDULUM, RKN6, 0.0, 1.0, Y0, ts=jnp.array(ts), throw=True)
+    with pytest.raises(RuntimeError, match=message):
+        dps.choose_step(jit(solve), 0.0, 1.0, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("adjoint", [dps.FixedStepAdjoint(), dfx.DirectAdjoint()])

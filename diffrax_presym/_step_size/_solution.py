@@ -12,7 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from .._results import STEP_DENSITY_MISSED
+from .._results import is_of_failed_solve, STEP_DENSITY_MISSED
 
 
 class Solution(NamedTuple):
@@ -50,7 +50,7 @@ class Solution(NamedTuple):
                     "The solve runs in the other direction of time. `t0` and `t1` must "
                     "be those that it passes to `diffeqsolve`, in this order."
                 ) from None
-            if "EquinoxRuntimeError" not in text:
+            if "EquinoxRuntimeError" not in text or not is_of_failed_solve(text):
                 raise
             missed = dfx.RESULTS[STEP_DENSITY_MISSED] in text
             return cls(number, number, np.zeros(0), [], False, None, missed=missed)
