@@ -198,8 +198,9 @@ SumOfDampings.__init__.__doc__ = "**Arguments:** its fields, if any."
 
 _FRICTION = "`friction`"
 _OF_PLACE = (
-    " For a rate that depends on place write `PositionDamping(rate)`, for any other "
-    "force `force=f`, with a function `f(t, q, v, args)`."
+    " Parameters of it are closed over, and differentiated so: build the system in the "
+    "function of them. For a rate that depends on place write `PositionDamping(rate)`, "
+    "for any other force `force=f`, with a function `f(t, q, v, args)`."
 )
 
 

@@ -38,21 +38,22 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
 
     Between steps the solution is a Hermite interpolation of degree 15, or 11 of schemes
     of order four, from four ends of steps, and within the steps of
-    `StepDensityController` of degree 7 from the two ends of a step. Within long steps
-    of schemes with many stages, `TunedRKN6`, `PresymplecticGauss` and compositions of
-    compositions, its error may be larger than that at the ends. Across kinks of the
-    force it is wrong: give their times to `StepsBetween`, also where steps of one
-    length end at all of them. Where it cannot follow the motion, it is a shorter step:
-    of schemes up to order two, of `TunedLinear8`, of systems with constraints or on
-    manifolds, in spans of fewer than three steps, where neighbouring steps of
-    `diffrax.StepTo` differ by more than a factor of two, and where friction over a step
-    is more than 0.5, its rate has no second derivative by time, or its matrix turns
-    momenta by more than a radian. The statistics say how many values are interpolated,
-    `sol.stats["interpolated"]`. How strong friction by place or by speed, of a
-    `LagrangianSystem` or in a `force` is, is estimated at the start of the solve alone
-    (a relaxation of 1 over a step): if it grows, choose the step by `choose_step` from
-    a solve that saves the same times. With `StepDensityController` values with such
-    friction are shorter steps. The force must have two derivatives by `jax.jvp`.
+    `StepDensityController` of degree 7 from the two ends of a step. Its error may be
+    larger than that at the ends within long steps of schemes with many stages,
+    `TunedRKN6`, `PresymplecticGauss` and compositions of compositions; and with a force
+    of few derivatives, as of a mesh or a spline, for which steps may end at the saved
+    times, `StepsBetween(ts)`. Across kinks in time it is wrong: give these to
+    `StepsBetween`, also where steps of one length end at all of them. Where it cannot
+    follow the motion, it is a shorter step: of schemes up to order two, of
+    `TunedLinear8`, of systems with constraints or on manifolds, in spans of fewer than
+    three steps, where neighbouring steps of `diffrax.StepTo` differ by more than a
+    factor of two, and where friction over a step is more than 0.5, its rate has no
+    second derivative by time, or its matrix turns momenta by more than a radian. The
+    number of interpolated values is `sol.stats["interpolated"]`. How strong friction by
+    place or by speed, of a `LagrangianSystem` or in a `force` is, is estimated at the
+    start of the solve alone (a relaxation of 1 over a step): if it grows, use
+    `choose_step` with the same saved times. With `StepDensityController` values with
+    such friction are shorter steps. The force must have two derivatives by `jax.jvp`.
 
     A solve whose final or saved states are not finite fails; of an explicit scheme it
     ends at the next saved time or end of a step that is used for one, as other steps
@@ -76,13 +77,12 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     backwards in time rounding errors grow by `exp(η(t1) - η(t0))`. So states are kept
     along the way, more with more damping, from which the backward pass restarts: a kept
     state is the start of its step, and with as many as steps none is recomputed, as in
-    short solves. The error of the recomputed states is measured. Where it is beyond
-    `tol` the gradient is NaN, of that member of a batch alone; outside of a batch that
-    is an error, unless the solve has `throw=False`. By `gradient="checkpoints"`, and
-    for schemes without an inverse, the steps between kept states are computed again
-    instead; the memory then grows with the square root of the number of steps. For
-    second derivatives use forward mode over reverse mode, `jax.jvp` of `jax.grad`; for
-    forward mode alone `diffrax.ForwardMode()`.
+    short solves. Where the measured error of the others is beyond `tol` the gradient is
+    NaN, of that member of a batch alone; outside of a batch that is an error, unless
+    the solve has `throw=False`. By `gradient="checkpoints"`, and for schemes without an
+    inverse, steps between kept states are computed again instead; the memory grows with
+    the square root of their number. For second derivatives use forward mode over
+    reverse mode, `jax.jvp` of `jax.grad`; for that alone `diffrax.ForwardMode()`.
     """
 
     gradient: Literal["reversal", "checkpoints"] | None = None

@@ -50,8 +50,10 @@ class ChosenStep(NamedTuple):
         note = (
             " The errors do not fall as those of a smooth motion, and may be larger "
             "than expected. If force or friction has kinks or jumps at known times, "
-            "write `stepsize_controller=StepsBetween(times)`; where it changes fast at "
-            "unknown times, as dry friction that is smoothed, use an adaptive solver."
+            "write `stepsize_controller=StepsBetween(times)`. At unknown times, as "
+            "of a force by a mesh or a spline, values between steps suffer most: give "
+            "it the saved times, if they are few. With a force that changes fast, as "
+            "dry friction that is smoothed, use an adaptive solver."
         )
         limit = (
             " Steps that are not much longer are unstable, or miss an event: for other "
@@ -158,7 +160,8 @@ def choose_step(
     solve does not use its step. `RuntimeError` if the
     tolerance cannot be reached: in this precision, because solves with more steps stop
     converging; within `max_steps`; or because no solve is finite. A solve that fails
-    or is not finite is not an error otherwise, but one with a step that is too large.
+    or is not finite is not an error otherwise, but one with a step that is too large;
+    other errors of the solve are raised as they are.
     """
     if not callable(solve):
         raise ValueError(
