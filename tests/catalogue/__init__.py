@@ -34,8 +34,8 @@ PRECISIONS = ["float64", "float32"]
 
 # What is exported and not combined here, and the file of tests that has it.
 ELSEWHERE = {
-    "StepDensityController",  # step_density
-    *("ChosenStep", "FixedStepAdjoint"),  # choose_step, adjoint
+    *("StepDensityController", "StepsBetween", "FixedStepAdjoint"),  # ways
+    "ChosenStep",  # choose_step
     "Stiefel",  # manifolds
     "MirrorMap",  # bregman
     *("Splitting", "SplittingTableau"),  # tableaus
