@@ -12,18 +12,20 @@ from jaxtyping import Array, Bool, Inexact
 from .._forms import matvec
 from .._numbers import as_time, cast_to, Scalar, Time
 from ._exponential import exponential_products, exponentials
-from ._log_scale import AbstractLogScale, by_quadrature, Effect, increment
+from ._log_scale import AbstractLogScale, by_quadrature, Effect, increment, Terms
 from ._near_singularity import by_powers
+from ._over_step import DecayOverStep
 
 
 class EntryFriction(eqx.Module):
     """Friction of a leaf by rates of its entries, of any log scales."""
 
-    terms: tuple[tuple[AbstractLogScale, Array], ...]
+    terms: Terms
+    within: DecayOverStep | None = None  # of a step, for spans of which it is prepared
 
     @property
     def is_autonomous(self) -> bool:
-        return all(law.is_autonomous for law, _ in self.terms)
+        return self.within is None and all(law.is_autonomous for law, _ in self.terms)
 
     @property
     def is_known(self) -> bool:
@@ -36,7 +38,12 @@ class EntryFriction(eqx.Module):
         is_number = lambda law, rate: law.shape == () and jnp.shape(rate) == ()
         return all(is_number(*term) for term in self.terms)
 
+    def over_step(self, t: Time, h: Time) -> "EntryFriction":
+        return EntryFriction(self.terms, DecayOverStep(self.terms, t, h))
+
     def prepare(self, t: Time, h: Time, order: int) -> Effect:
+        if self.within is not None:
+            return self.within.effect(t, h)
         if len(self.terms) == 1:
             ((law, rate),) = self.terms
             effect = law.effect(rate, t, h, order)
@@ -83,6 +90,9 @@ class EntryFriction(eqx.Module):
         return jnp.where(functools.reduce(jnp.logical_or, singular), limit, net)
 
     def growth(self, t: Time, h: Time) -> Scalar:
+        if self.within is not None:
+            # Of so much that rounding matters no polynomial is right to rounding.
+            return jnp.zeros_like(as_time(h))
         return jnp.max(increment(self.terms, t, h), initial=-jnp.inf)
 
     def angle(self, h: Time) -> Scalar:

@@ -14,10 +14,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Inexact
 from numpy.polynomial import chebyshev
 
-from .._numbers import as_time, cast_to, Scalar, Time
+from .._numbers import as_time, cast_to, Time
 from ._exponential import expm1
-from ._leaf import EntryFriction
-from ._log_scale import Effect, increment
+from ._log_scale import Effect, increment, Terms
 
 
 # Rounding of `float64` is reached where friction over a step is at most about two.
@@ -29,10 +28,9 @@ _INTEGRALS = chebyshev.chebint(_COEFFICIENTS, lbnd=-1) / 2
 _POLYNOMIALS = np.stack([np.pad(_COEFFICIENTS, ((0, 1), (0, 0))), _INTEGRALS], axis=1)
 
 
-class FrictionOverStep(eqx.Module):
-    """Friction of a leaf by rates of its entries, for spans within one step."""
+class DecayOverStep(eqx.Module):
+    """The decay from the start of a step as polynomials, for spans within it."""
 
-    exact: EntryFriction
     start: Float[Array, ""]
     length: Float[Array, ""]
     # Chebyshev coefficients of the decay from the start, less one, and of its integral;
@@ -40,30 +38,12 @@ class FrictionOverStep(eqx.Module):
     decayed: Inexact[Array, "nodes 2 ..."]
     grown: Inexact[Array, "nodes 2 ..."]
 
-    def __init__(self, exact: EntryFriction, start: Time, length: Time):
-        self.exact, self.start, self.length = exact, as_time(start), as_time(length)
+    def __init__(self, terms: Terms, start: Time, length: Time):
+        self.start, self.length = as_time(start), as_time(length)
         points = cast_to(_POINTS, self.length) * self.length
-        lost = jax.vmap(lambda s: increment(exact.terms, self.start, s))(points)
+        lost = jax.vmap(lambda s: increment(terms, self.start, s))(points)
         fit = lambda x: jnp.tensordot(cast_to(_POLYNOMIALS, x), x, 1)
         self.decayed, self.grown = fit(expm1(-lost)), fit(expm1(lost))
-
-    is_autonomous = False
-    is_known = False
-
-    @property
-    def is_one_rate(self) -> bool:
-        return self.exact.is_one_rate
-
-    def growth(self, t: Time, h: Time) -> Scalar:
-        # Of so much friction that rounding matters no polynomial is right to rounding.
-        return jnp.zeros_like(as_time(h))
-
-    def strength(self, t: Time, h: Time) -> Scalar:
-        return self.exact.strength(t, h)
-
-    def scaled(self, factor: Scalar) -> EntryFriction:
-        # Another decay, which is no multiple of this.
-        return self.exact.scaled(factor)
 
     @property
     def converged(self) -> Bool[Array, ""]:
@@ -76,7 +56,7 @@ class FrictionOverStep(eqx.Module):
         first, last = jnp.max(size[:2], axis=0), jnp.max(size[2:], axis=0)
         return jnp.all((last < jnp.inf) & (last * last <= eps * (first + 4 * eps)))
 
-    def prepare(self, t: Time, h: Time, order: int) -> Effect:
+    def effect(self, t: Time, h: Time) -> Effect:
         since = as_time(t) - self.start
         ends = since / self.length, (since + as_time(h)) / self.length
         at = lambda x: [_values(x, s) for s in ends]
