@@ -13,6 +13,8 @@ from choosing import PENDULUM, RKN6, solve_of, Y0
 from helpers import check_members
 
 import diffrax_presym as dps
+from diffrax_presym._step_size._convergence import find_steps
+from diffrax_presym._step_size._solution import Solution
 
 
 GAUSS = dps.PresymplecticGauss
@@ -273,6 +275,21 @@ def test_second_derivatives_of_a_batch_by_its_friction():
     got = jax.jit(jax.vmap(second))(ks)
     wanted = [(slope(k + h) - slope(k - h)) / (2 * h) for k in ks]
     np.testing.assert_allclose(got, wanted, rtol=1e-5)
+
+
+def test_a_chosen_step_has_no_shorter_one_that_failed():
+    """As where a table has kinks at 41 saved times, at which steps end by chance."""
+    ts, known = np.linspace(0.0, 1.0, 41), {4: 90.0, 9: 20.0, 19: 0.7, 30: 1.5}
+
+    def solution(n):
+        error = known.get(n, 1.2) if n % 40 else 1e-4 * (40 / n) ** 6
+        values = [np.array([1 + error]), ts]
+        return Solution(n, n, ts, values, True, 6, interpolates=True, values=1)
+
+    trials: list = []
+    choice = find_steps(solution, (0.0, 1.0), (0.0, 1.0), 10_000, trials.append)
+    assert [x.error > 1 for x in trials if x.steps == 30] == [True]
+    assert choice.best.steps == 40
 
 
 @pytest.mark.parametrize("jit", [lambda fn: fn, jax.jit])

@@ -5,7 +5,8 @@ from typing import Any, NamedTuple
 import jax
 from jaxtyping import Array, ArrayLike, Float
 
-from ._convergence import find_steps, Trial
+from ._convergence import find_steps
+from ._law import Trial
 from ._solution import check_number, check_times, Solution
 
 

@@ -1,8 +1,4 @@
-"""Solves with more and more steps until they converge, and the cheapest that suffices.
-
-An error is the difference to the finest solution, over the tolerance, corrected by the
-law of convergence for the error of that.
-"""
+"""Solves with more and more steps until they converge, and the cheapest."""
 
 import itertools
 import math
@@ -12,97 +8,16 @@ from typing import NamedTuple
 import numpy as np
 
 from ._grid import Grid
-from ._solution import scaled_error, Solution
+from ._law import Law, Trial
+from ._solution import Solution
 
 
 # The error that is aimed at, and that with which the search ends, over the tolerance.
 AIM, ENOUGH = 0.6, 0.4
-# With fewer steps solves may all miss a short push, and agree on that.
-SEEING = 50
 # With fewer steps these may be too long for the motion, and not converge for that.
 PATIENCE = 2000
 # Among so many numbers the best is chosen.
 _CANDIDATES = 100_000
-
-
-class Trial(NamedTuple):
-    """A solve made to choose a step."""
-
-    steps: int
-    # The estimated error over the tolerance; infinite if the solve is not finite.
-    error: float
-    number: int  # of steps that was asked for
-
-    def order(self, finer: "Trial") -> float:
-        """With which errors fall, if that is known."""
-        if (
-            not 0
-            < min(self.error, finer.error)
-            <= max(self.error, finer.error)
-            < np.inf
-        ):
-            return math.nan
-        return math.log(self.error / finer.error) / math.log(finer.steps / self.steps)
-
-
-class Law(NamedTuple):
-    """How solves converge: the steps tried, each with the difference to the next
-    solution in place of its error, and the finest solution."""
-
-    ladder: tuple[Trial, ...]
-    finest: Solution
-    claimed: int | None
-    tolerances: tuple[float, float]
-
-    def add(self, finer: Solution) -> "Law":
-        law = self._replace(finest=finer, claimed=finer.order or self.claimed)
-        last = self.finest
-        step = Trial(last.steps, law.difference(last), last.number)
-        return law._replace(ladder=(*self.ladder, step))
-
-    @property
-    def orders(self) -> list[float]:
-        pairs = itertools.pairwise(self.ladder)
-        return [math.nan, math.nan, *(a.order(b) for a, b in pairs)]
-
-    @property
-    def least(self) -> float:
-        """The lowest order of a smooth problem."""
-        return (self.claimed or min(max(self.orders[-1], 1), 4)) / 2 + 0.4
-
-    def exceeds(self, order: float, last: int | None = None) -> bool:
-        """Whether the last two orders, or earlier ones, are at least this one."""
-        return all(x >= order for x in self.orders[:last][-2:])
-
-    @property
-    def converges(self) -> bool:
-        # An order far above the claim is that of leaving an unstable step behind.
-        most = 2 * (self.claimed or 10) + 1
-        return self.exceeds(0.75) or self.least - 0.4 <= self.orders[-1] <= most
-
-    @property
-    def agrees(self) -> bool:
-        """Whether four solves do: to rounding, or exactly."""
-        three = self.ladder[-3:]
-        seen = len(three) == 3 and three[-1].steps >= SEEING
-        return seen and max(x.error for x in three) <= 0.5
-
-    def difference(self, solution: Solution) -> float:
-        if not (solution.finite and self.finest.finite):
-            return math.inf
-        return scaled_error(solution.leaves, self.finest.leaves, *self.tolerances)
-
-    def trial(self, solution: Solution) -> Trial:
-        error, steps, order = self.difference(solution), solution.steps, self.orders[-1]
-        order = order if order >= 0.75 else (self.claimed or 2)
-        if steps < self.finest.steps:
-            error /= 1 - (steps / self.finest.steps) ** order
-        elif error <= 1:
-            # At least as fine as the finest: an error that falls from the last one.
-            last = self.ladder[-1]
-            order = min(order, self.claimed or order)
-            error = last.error * (last.steps / steps) ** order
-        return Trial(steps, error, solution.number)
 
 
 class Choice(NamedTuple):
@@ -123,6 +38,7 @@ def find_steps(
     report: Callable[[Trial], None],
 ) -> Choice:
     law = grid = doubted = None
+    failed: list[Trial] = []  # with which a step is doubted that is longer
     interpolates: dict[int, bool] = {}  # whether a solve does, by its number of steps
     same, numbers, expected = 0, doubling(4), float
     while expected(n := next(numbers)) <= max_steps:
@@ -160,6 +76,8 @@ def find_steps(
                 solution = law.finest if n == law.finest.number else solve(n)
                 interpolates[n] = solution.interpolates
                 report(trial := law.trial(solution))
+                if trial.error > 1:
+                    failed.append(trial)
                 return trial
 
             smooth = _is_smooth(law, high, grid, measure)
@@ -170,7 +88,9 @@ def find_steps(
             order = math.nan if rounding else law.orders[-1]
             choice = Choice(high, order, law.claimed, smooth, grid)
             if smooth or doubted:
-                best = _smallest(law, high, grid, measure) if smooth else high
+                best = high
+                if smooth:
+                    best = _smallest(law, failed, high, grid, measure)
                 own = grid.of_solve(interpolates[best.number])
                 more = int(own.cheaper(np.array([best.number]))[0])
                 if best.number < more and expected(more) <= max_steps:
@@ -207,11 +127,13 @@ def _is_smooth(law: Law, high: Trial, grid: Grid, measure) -> bool:
     return True
 
 
-def _smallest(law: Law, high: Trial, grid: Grid, measure) -> Trial:
-    """A smaller number of steps that reaches the tolerance."""
-    too_few = [x for x in law.ladder[:-1] if x.error > 1]
-    low = too_few[-1] if too_few else Trial(0, math.inf, 0)
-    steepest, failed = 1.5 * (law.claimed or 20), False
+def _smallest(law: Law, failed: list[Trial], high: Trial, grid: Grid, measure) -> Trial:
+    """A smaller number of steps that reaches the tolerance, as all that were tried
+    between the two."""
+    few = [x for x in (*law.ladder[:-1], *failed) if x.error > 1]
+    few = [x for x in few if x.number < high.number]
+    low = max(few, key=lambda x: x.number, default=Trial(0, math.inf, 0))
+    steepest, again = 1.5 * (law.claimed or 20), False
     # The first that sufficed: those after it may differ by rounding alone.
     first = next(x.number for x in law.ladder if x.number > low.number)
     first = int(grid.cheaper(np.array([first]))[0])
@@ -231,11 +153,11 @@ def _smallest(law: Law, high: Trial, grid: Grid, measure) -> Trial:
             slope = math.log(low.error / error) / math.log(high.number / low.number)
             slope = min(slope, steepest)
         guess = high.number * (error / AIM) ** (1 / slope)
-        if failed:  # Not again close to the lower end.
+        if again:  # Not close to the lower end.
             guess = max(guess, math.sqrt(low.number * high.number))
         trial = measure(int(numbers[np.argmin(np.abs(numbers - guess))]))
-        failed = trial.error > 1
-        low, high = (trial, high) if failed else (low, trial)
+        again = trial.error > 1
+        low, high = (trial, high) if again else (low, trial)
     return high
 
 
