@@ -33,17 +33,27 @@ def as_finite(x, name: str, instead: str = "") -> Inexact[Array, "..."]:
     """As `as_parameter`, and checked to be finite unless it is traced."""
     parameter = as_parameter(x, name, instead)
     # Under `jax.jit` a parameter is traced, but not what it was made of.
-    if not isinstance(x, Tracer) and not np.all(np.isfinite(np.asarray(x))):
-        raise ValueError(f"{name} must be finite, but got {x}.")
+    if not isinstance(x, Tracer) and not np.all(good := np.isfinite(np.asarray(x))):
+        raise ValueError(f"{name} must be finite, but got {_first(x, good)}.")
     return parameter
 
 
 def as_positive(x, name: str, instead: str = "") -> Inexact[Array, "..."]:
     """As `as_parameter`, and checked to be positive unless it is traced."""
     parameter = as_parameter(x, name)
-    if not isinstance(x, Tracer) and not np.all(np.asarray(x) > 0):
-        raise ValueError(f"{name} must be positive, but got {x}.{instead}")
+    if not isinstance(x, Tracer) and not np.all(good := np.asarray(x) > 0):
+        got = _first(x, good)
+        raise ValueError(f"{name} must be positive, but got {got}.{instead}")
     return parameter
+
+
+def _first(x, good: np.ndarray) -> str:
+    """What is not good, of a long array the first of it."""
+    if good.size <= 9:
+        return str(x)
+    place = tuple(map(int, np.argwhere(~good)[0]))
+    index = str(place[0]) if good.ndim == 1 else str(place)
+    return f"{np.asarray(x)[place]} at the index {index}"
 
 
 def check_callable(

@@ -1,5 +1,6 @@
 """Linear maps in the forms that users write: masses, stiffnesses, friction."""
 
+import operator
 from functools import partial
 
 import equinox as eqx
@@ -161,7 +162,10 @@ def matvec(matrix: Array, x: Array) -> Array:
     return jnp.sum(matrix * x[..., None, :], axis=-1)
 
 
-def multiply(form, x: PyTree, name: str, state: str, symmetric=True) -> PyTree:
+def multiply(
+    form, x: PyTree, name: str, state: str, symmetric=True, product=operator.mul
+) -> PyTree:
+    """The form times `x`, of numbers for its entries by a `product`."""
     if form is None:
         return x
     if is_operator(form):
@@ -169,9 +173,18 @@ def multiply(form, x: PyTree, name: str, state: str, symmetric=True) -> PyTree:
         return form.mv(x)
 
     def leaf(x, form):
-        return matvec(form, x) if is_matrix(form, x) else form * x
+        return matvec(form, x) if is_matrix(form, x) else product(form, x)
 
     return jtu.tree_map(leaf, x, fit_form(form, x, name, state, symmetric))
+
+
+def momentum(mass, v: PyTree, name: str, state: str, symmetric=True) -> PyTree:
+    """The mass times the velocity: zero at rest, also of an infinite mass."""
+
+    def product(m: Array, v: Array) -> Array:
+        return jnp.where(jnp.isinf(m) & (v == 0), 1, m) * v
+
+    return multiply(mass, v, name, state, symmetric, product)
 
 
 def divide(form, x: PyTree, name: str, state: str, symmetric=True) -> PyTree:

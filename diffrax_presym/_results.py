@@ -48,8 +48,10 @@ FORCE_NOT_SOLVED = _entry(
     "force_not_solved",
     "The equation of a kick by a `force` of the velocity was not solved, or the state "
     "left the finite numbers: the force is too stiff for the step, whose length times "
-    "its slope by momentum must be below about 2. Take shorter steps, or use "
-    "`PresymplecticGauss(stages, optimistix.Newton(rtol, atol))`.",
+    "its slope by momentum must be below about 2. Take shorter steps; write what is "
+    "linear in the velocity as `friction=ViscousDamping(C)`, also with a function "
+    "`C(t, q, args)`; or use `PresymplecticGauss(stages, optimistix.Newton(rtol, "
+    "atol))`, but on manifolds.",
 )
 ROOT_NOT_FOUND = _entry(
     "root_not_found",

@@ -190,6 +190,20 @@ def test_states_by_velocities(system):
     assert_close(jax.tree.map(lambda x: x[0], sol.ys), (q, v), 1e-13)
 
 
+def test_no_momentum_of_an_infinite_mass_at_rest():
+    """As of a position that counts what nothing depends on."""
+    mass, v = jnp.array([2.0, jnp.inf]), jnp.array([0.3, 0.0])
+    system = dps.MechanicalSystem(dps.QuadraticKinetic(mass), harmonic)
+    body = dps.Attitude(jnp.ones(3)), dps.Euclidean(mass)
+    product = dps.ManifoldSystem(body, lambda t, q, args: 0.0)
+    turned = jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(2)
+    momentum = lambda v: system.from_velocity(0.0, (jnp.zeros(2), v))[1]
+    _, (_, p) = product.from_velocity(0.0, (turned, (jnp.zeros(3), v)))
+    for found in (momentum(v), p):
+        np.testing.assert_array_equal(found, [0.6, 0.0])
+    assert np.isfinite(jax.grad(lambda v: momentum(v)[0])(v)).all()
+
+
 def test_momenta_of_large_velocities():
     matrix = jnp.array([[2.0, 0.3, 0.1], [0.3, 1.7, 0.2], [0.1, 0.2, 3.3]])
     general = dps.Hamiltonian(lambda t, q, p, args: p @ matrix @ p / 2)

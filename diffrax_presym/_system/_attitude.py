@@ -16,6 +16,12 @@ from ._manifolds import AbstractManifold, Both, inner, size
 _CROSS = np.cross(np.eye(3)[:, None], np.eye(3)).T
 
 
+_TENSOR = (
+    " Of an inertia tensor write the eigenvalues, of `jnp.linalg.eigh`, whose "
+    "eigenvectors are the axes of the body."
+)
+
+
 class Attitude(AbstractManifold):
     """The attitude of a rigid body: a quaternion of length one, over the last axis, the
     real part first. Its momentum is the angular momentum along the principal axes of
@@ -51,7 +57,7 @@ class Attitude(AbstractManifold):
         - `inertia`: the three principal moments of inertia, positive, in any order; for
             several bodies of shape `(n, 3)`.
         """
-        self.inertia = as_positive(inertia, "`Attitude(inertia)`")
+        self.inertia = as_positive(inertia, "`Attitude(inertia)`", _TENSOR)
         if jnp.shape(self.inertia)[-1:] != (3,):
             raise ValueError(
                 "`Attitude(inertia)` needs three principal moments, but got the shape "

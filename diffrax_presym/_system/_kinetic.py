@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Inexact, PyTree
 
 from .. import _tree as tree
 from .._checks import as_positive, check_callable, scalar_fn
-from .._forms import as_mass, divide, inverse, is_symmetric, multiply
+from .._forms import as_mass, divide, inverse, is_symmetric, momentum, multiply
 from .._friction._base import MASS
 from .._friction._exponential import gauss_legendre
 from .._friction._linear import LinearFriction
@@ -150,7 +150,7 @@ class QuadraticKinetic(AbstractKinetic):
 
     def momentum(self, v: PyTree) -> PyTree:
         """The momentum `M v` of a velocity."""
-        return multiply(self.mass, v, MASS, "q", self.symmetric)
+        return momentum(self.mass, v, MASS, "q", self.symmetric)
 
     def flow_is_known(self, friction) -> bool:
         return friction is None or friction.is_known

@@ -13,7 +13,7 @@ from jaxtyping import PyTree
 from .. import _tree as tree
 from .._checks import check_callable, describe, match
 from .._compositions import lengths, over_stages
-from .._forms import divide, multiply
+from .._forms import divide, momentum
 from .._friction._base import AbstractFriction, MASS, Mechanics
 from .._friction._damping import as_laws
 from .._friction._fit import has_rates
@@ -183,7 +183,7 @@ class ManifoldSystem(AbstractSystem):
     def from_velocity(self, t: Time, y: tuple[Q, P], args: PyTree = None) -> State:
         """The state `(q, p)` of positions and velocities `(q, v)`, which of an
         `Attitude` are angular velocities along the axes of the body."""
-        return y[0], multiply(self.mechanics.mass, y[1], MASS, "v")
+        return y[0], momentum(self.mechanics.mass, y[1], MASS, "v")
 
     def to_velocity(self, t: Time, y: State, args: PyTree = None) -> tuple[Q, P]:
         """Positions and velocities `(q, v)` of a state `(q, p)`, of an `Attitude`
