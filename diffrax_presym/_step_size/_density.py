@@ -86,9 +86,9 @@ class StepDensityController(dfx.AbstractStepSizeController):
 
         - `epsilon`: the step size `ε` where the density is one; a positive number, in
             units of time if the density has none.
-        - `density`: the step density `σ`: the system, whose time scale it is; or a
-            function `density(t, y, args)` that returns a positive scalar, for example
-            `lambda t, y, args: jnp.linalg.norm(y[0]) ** 1.5`.
+        - `density`: the step density `σ`, larger where steps are longer: the system,
+            whose time scale it is; or a function `density(t, y, args)` that returns a
+            positive scalar, as `lambda t, y, args: jnp.linalg.norm(y[0]) ** 1.5`.
 
         **Raises:**
 
