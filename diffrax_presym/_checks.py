@@ -34,7 +34,7 @@ def as_finite(x, name: str, instead: str = "") -> Inexact[Array, "..."]:
     parameter = as_parameter(x, name, instead)
     # Under `jax.jit` a parameter is traced, but not what it was made of.
     if not isinstance(x, Tracer) and not np.all(good := np.isfinite(np.asarray(x))):
-        raise ValueError(f"{name} must be finite, but got {_first(x, good)}.")
+        raise ValueError(f"{name} must be finite, but got {_not_good(x, good)}.")
     return parameter
 
 
@@ -42,12 +42,12 @@ def as_positive(x, name: str, instead: str = "") -> Inexact[Array, "..."]:
     """As `as_parameter`, and checked to be positive unless it is traced."""
     parameter = as_parameter(x, name)
     if not isinstance(x, Tracer) and not np.all(good := np.asarray(x) > 0):
-        got = _first(x, good)
+        got = _not_good(x, good)
         raise ValueError(f"{name} must be positive, but got {got}.{instead}")
     return parameter
 
 
-def _first(x, good: np.ndarray) -> str:
+def _not_good(x, good: np.ndarray) -> str:
     """What is not good, of a long array the first of it."""
     if good.size <= 9:
         return str(x)
@@ -127,8 +127,8 @@ def scalar_fn(fn, name: str):
 
 
 def match(value: PyTree, like: PyTree, name: str, like_name: str) -> PyTree:
-    """A user's velocity or force, cast to the leaves of the state, of whose shapes it
-    must be: one of fewer axes may be meant for other entries than it would reach."""
+    """A user's velocity or force, cast to the leaves of the state. It must have their
+    shapes: one that broadcasts to these may be meant for some entries alone."""
     if jtu.tree_structure(value) != jtu.tree_structure(like):
         raise ValueError(
             f"{name} must return a pytree of the same structure as {like_name}, "
@@ -147,7 +147,7 @@ def match(value: PyTree, like: PyTree, name: str, like_name: str) -> PyTree:
         raise ValueError(
             f"{name} must return arrays of the shapes of {like_name}, but returned "
             f"shape {jnp.shape(v)} for a leaf of shape {jnp.shape(x)}. If one value is "
-            f"meant for all entries, write `jnp.full_like`."
+            "meant for all entries, write `jnp.full_like`."
         )
 
     return jtu.tree_map(leaf, value, like)

@@ -39,6 +39,7 @@ class EntryFriction(eqx.Module):
         return all(is_number(*term) for term in self.terms)
 
     def over_step(self, t: Time, h: Time) -> "EntryFriction":
+        """The same for spans within a step, by polynomials."""
         return EntryFriction(self.terms, DecayOverStep(self.terms, t, h))
 
     def prepare(self, t: Time, h: Time, order: int) -> Effect:

@@ -38,7 +38,7 @@ def find_steps(
     report: Callable[[Trial], None],
 ) -> Choice:
     law = grid = doubted = None
-    failed: list[Trial] = []  # with which a step is doubted that is longer
+    failed: list[Trial] = []  # No longer step is chosen than those of these.
     interpolates: dict[int, bool] = {}  # whether a solve does, by its number of steps
     same, numbers, expected = 0, doubling(4), float
     while expected(n := next(numbers)) <= max_steps:
