@@ -49,6 +49,20 @@ def test_the_effect_of_a_logarithm_and_another_law(kind, order, tolerance):
                 assert found.carried[i] == 0
 
 
+@pytest.mark.parametrize("t", [0.0, 0.05, 0.6])
+def test_derivatives_by_a_whole_strength(t):
+    """By which powers of time have integrals that are logarithms."""
+
+    def effect(rate):
+        terms = (Logarithm(None), rate), (LinearScale(), jnp.asarray(0.7))
+        return jnp.stack(EntryFriction(terms).prepare(t, 0.3, 6))
+
+    rates, h = jnp.array([1.0, 2.0, 3.0, 4.0]), 1e-5
+    slope = jax.jit(jax.vmap(jax.jacfwd(effect)))(rates)
+    both = jax.vmap(effect)(rates + h), jax.vmap(effect)(rates - h)
+    np.testing.assert_allclose(slope, (both[0] - both[1]) / (2 * h), 1e-7, 1e-10)
+
+
 def _total(rate, factor, eta, t):
     return rate * np.log(t) + factor * eta(t)
 

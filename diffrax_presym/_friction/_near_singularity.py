@@ -99,8 +99,10 @@ def _moments(
             jnp.where(a > 0, last * left, first),
             jnp.where(b < 0, first * left, last),
         )
-        carried.append(x * of_start * expm1_and_ratio(-jnp.abs(a))[1])
-        responded.append(x * of_end * expm1_and_ratio(-jnp.abs(b))[1])
+        # Not by the absolute value, whose derivative at zero is not that of either.
+        a, b = jnp.where(a > 0, -a, a), jnp.where(b < 0, b, -b)
+        carried.append(x * of_start * expm1_and_ratio(a)[1])
+        responded.append(x * of_end * expm1_and_ratio(b)[1])
         first, last = first * start / unit, last * end / unit
     # What has friction does not leave a singularity.
     lost = singular & (c != 0)
