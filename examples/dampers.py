@@ -158,7 +158,7 @@ def main():
         options=dict(ftol=1e-12, gtol=1e-9, maxiter=300),
     )
     logs = jnp.asarray(fit.x)
-    forward = partial(angles, *problem, dfx.ForwardMode(), chosen.dt0)
+    forward = partial(angles, *problem, dps.FixedStepAdjoint("forward"), chosen.dt0)
     slopes = jax.jit(jax.jacfwd(forward))(logs).reshape(-1, n)
     spread = NOISE * np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
     estimate = np.exp(logs)

@@ -103,9 +103,10 @@ def fit(logs, starts, ts, data, part):
 @jax.jit
 def predict(logs, starts, step):
     """Positions on the whole grid, and their derivatives in the parameters."""
+    forward = dps.FixedStepAdjoint("forward")
 
     def twice(logs):
-        q = positions(logs, starts, jnp.asarray(GRID), dfx.ForwardMode(), step)
+        q = positions(logs, starts, jnp.asarray(GRID), forward, step)
         return q, q
 
     # Forward mode, as there are more outputs than inputs.

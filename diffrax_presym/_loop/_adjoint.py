@@ -1,6 +1,6 @@
 """The loop of the package, as an adjoint of Diffrax."""
 
-from functools import reduce
+from functools import partial, reduce
 from typing import Literal
 
 import diffrax as dfx
@@ -14,7 +14,7 @@ from jaxtyping import PyTree
 from .. import _tree as tree
 from .._checks import as_positive
 from .._numbers import State
-from .._scheme._base import AbstractPresymplecticSolver, Point, Scheme
+from .._scheme._base import Point, Scheme
 from .._step_size._density import StepDensityController
 from .._system._bound import bind
 from . import _diffrax as private
@@ -24,7 +24,8 @@ from ._one_function import as_one_function
 from ._problem import Problem
 from ._pull import pulls
 from ._run import run, saved_rows
-from ._steps_between import known_steps, StepsBetween
+from ._steps_between import known_steps
+from ._supported import check_history, check_supported, KNOWN
 from ._variable import VariableSteps
 
 
@@ -82,19 +83,21 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     the solve has `throw=False`. By `gradient="checkpoints"`, and for schemes without an
     inverse, steps between kept states are computed again instead; the memory grows with
     the square root of their number. For second derivatives use forward mode over
-    reverse mode, `jax.jvp` of `jax.grad`; for that alone `diffrax.ForwardMode()`.
+    reverse mode, `jax.jvp` of `jax.grad`. Forward mode alone, `jax.jvp` and
+    `jax.jacfwd`, is by `gradient="forward"`: for many outputs of few inputs, at the
+    cost of about two solves for each of them.
     """
 
-    gradient: Literal["reversal", "checkpoints"] | None = None
+    gradient: Literal["reversal", "checkpoints", "forward"] | None = None
     checkpoints: int | None = None
     tol: float | None = None
     throw: bool | None = None
 
     def __check_init__(self):
-        if self.gradient not in (None, "reversal", "checkpoints"):
+        if self.gradient not in (None, "reversal", "checkpoints", "forward"):
             raise ValueError(
-                '`FixedStepAdjoint(gradient=...)` must be "reversal", "checkpoints" or '
-                f"`None`, but got {self.gradient!r}."
+                '`FixedStepAdjoint(gradient=...)` must be "reversal", "checkpoints", '
+                f'"forward" or `None`, but got {self.gradient!r}.'
             )
         number = self.checkpoints
         if number is not None and (type(number) is not int or number < 0):
@@ -124,20 +127,27 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         passed_controller_state,
         progress_meter,
     ):
+        subs, structure = private.flatten_subs(saveat)
+        if self.gradient == "forward":
+            fixed = partial(eqxi.nondifferentiable, msg=_TIMES)
+            t0, t1, dt0 = fixed((t0, t1, dt0))
+            if isinstance(stepsize_controller, KNOWN):
+                stepsize_controller = fixed(stepsize_controller)
+            at = lambda sub: eqx.tree_at(lambda sub: sub.ts, sub, replace_fn=fixed)
+            subs = [sub if sub.ts is None else at(sub) for sub in subs]
         y, carry, made_jump, meter, control = private.start_of(init_state)
         # Of friction at a place it has the user's objects, whose fields may be numbers.
         carry = jtu.tree_map(jnp.asarray, carry)
         system = bind(terms, args, y).factorised(y)
         unsupported = event, saveat, passed_controller_state
-        _check(solver, stepsize_controller, *unsupported)
+        check_supported(solver, stepsize_controller, *unsupported)
         scheme = solver.scheme(system)
-        _check_history(solver, scheme, stepsize_controller)
+        check_history(solver, scheme, stepsize_controller)
         way = self._way(solver, scheme, (y, carry), max_steps, throw)
         restart = lambda y: scheme.start(system, system.time(t0), y)
         if made_jump is not False:
             # The solver state is stale, and is recomputed before the first step.
             carry = lax.cond(made_jump, restart, lambda _: carry, y)
-        subs, structure = private.flatten_subs(saveat)
         if isinstance(stepsize_controller, StepDensityController):
             steps = VariableSteps(t0, t1, stepsize_controller, dt0)
         else:
@@ -171,8 +181,11 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
 
     def _way(
         self, solver, scheme: Scheme, start: Point, max_steps: int | None, throw: bool
-    ) -> "Reversal | Checkpoints":
-        """How the gradient is taken; an error if the scheme does not allow it."""
+    ) -> "Reversal | Checkpoints | None":
+        """How the gradient is taken, `None` if forwards; an error if the scheme does
+        not allow it."""
+        if self.gradient == "forward":
+            return None
         if self.gradient == "reversal" and not scheme.is_invertible:
             raise ValueError(
                 f"A step of `{type(solver).__name__}` has no known inverse. Write "
@@ -192,8 +205,9 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
 
 FixedStepAdjoint.__init__.__doc__ = """**Arguments:**
 
-- `gradient`: `"reversal"`, by running the scheme backwards, or `"checkpoints"`, by
-    computing steps again. Defaults to `None`: by reversal if the scheme has an inverse.
+- `gradient`: `"reversal"`, by running the scheme backwards, `"checkpoints"`, by
+    computing steps again, or `"forward"`, for forward mode. Defaults to `None`: by
+    reversal if the scheme has an inverse.
 - `checkpoints`: the maximum number of states to keep besides the two ends, which
     determines the memory. Defaults to `None`: for reversal 128, or of a large state
     as many as need 16 MB, but at least 16; for checkpoints the square root of
@@ -215,63 +229,29 @@ whose times do not start at `t0` and end at `t1`.
 """
 
 
-def _check(solver, controller, event, saveat, passed_controller_state) -> None:
-    what, instead = None, "`diffrax.RecursiveCheckpointAdjoint()`"
-    # An instance of `HalfSolver` is one of the class of the solver in it.
-    known = isinstance(solver, AbstractPresymplecticSolver)
-    if not known or isinstance(solver, dfx.HalfSolver):
-        what = f"`{type(solver).__name__}`, only solvers of this package"
-    elif not isinstance(controller, (*_KNOWN, StepDensityController)):
-        what = (
-            f"`{type(controller).__name__}`, only `ConstantStepSize`, `StepTo`, "
-            "`StepsBetween` and `StepDensityController`"
-        )
-    elif event is not None:
-        what = "events"
-    elif saveat.dense:
-        what = "dense output"
-    elif not isinstance(controller, _KNOWN) and _saves_both(saveat):
-        what = "times and steps in one output of `StepDensityController`"
-        instead = "`SaveAt(subs=[SubSaveAt(ts=...), SubSaveAt(steps=...)])`"
-    elif isinstance(controller, _KNOWN) and passed_controller_state:
-        what = "a `controller_state`"
-    if what is not None:
-        raise ValueError(
-            f"`FixedStepAdjoint` does not support {what}. Use {instead} instead."
-        )
+_TIMES = (
+    "`FixedStepAdjoint` does not support derivatives with respect to times (`t0`, "
+    "`t1`, `dt0`, `ts`). Use `diffrax.RecursiveCheckpointAdjoint()` instead, or in "
+    "forward mode `diffrax.ForwardMode()`."
+)
+_BACKWARD = (
+    '`FixedStepAdjoint("forward")` is for forward mode, `jax.jvp` and `jax.jacfwd`. '
+    "For `jax.grad` write `FixedStepAdjoint()`."
+)
 
 
-_KNOWN = dfx.ConstantStepSize, dfx.StepTo, StepsBetween
-
-
-def _saves_both(saveat: dfx.SaveAt) -> bool:
-    subs, _ = private.flatten_subs(saveat)
-    return any(sub.steps and sub.ts is not None for sub in subs)
-
-
-def _check_history(solver, scheme: Scheme, controller) -> None:
-    if scheme.has_history and isinstance(controller, StepDensityController):
-        raise ValueError(
-            f"`{type(solver).__name__}` needs equal steps. With `StepDensityController`"
-            " use `TunedRKN6()` or `BlanesCasasRKN8()`."
-        )
-    if scheme.has_history and isinstance(controller, StepsBetween):
-        raise ValueError(
-            "Steps end at the times of `StepsBetween` because the motion is not smooth "
-            f"there, where the history of `{type(solver).__name__}` is of no use. Use "
-            "`TunedRKN6()` or `BlanesCasasRKN8()`."
-        )
-
-
-def _final_state(problem: Problem, way: Reversal | Checkpoints, init_state, structure):
+def _final_state(
+    problem: Problem, way: Reversal | Checkpoints | None, init_state, structure
+):
     """Diffrax's state at the end of the solve."""
-    buffers = private.saved_buffers(init_state, structure)
-    out = _solve((problem, buffers), way)
-    out, counts = eqx.partition(out, eqx.is_inexact_array)
-    # To JAX all outputs of a custom rule have derivatives, even integers.
-    end, saved, n, result, meter, interpolated = eqx.combine(
-        out, eqxi.nondifferentiable_backward(counts)
-    )
+    inputs = problem, private.saved_buffers(init_state, structure)
+    if way is None:
+        out = eqxi.nondifferentiable_backward(_forwards(*inputs), msg=_BACKWARD)
+    else:
+        out, counts = eqx.partition(_solve(inputs, way), eqx.is_inexact_array)
+        # To JAX all outputs of a custom rule have derivatives, even integers.
+        out = eqx.combine(out, eqxi.nondifferentiable_backward(counts))
+    end, saved, n, result, meter, interpolated = out
     carry, control = problem.steps.split(end[1])
     final = private.final_state(
         init_state,
@@ -288,11 +268,14 @@ def _final_state(problem: Problem, way: Reversal | Checkpoints, init_state, stru
     return final, interpolated
 
 
-@eqx.filter_custom_vjp
-def _solve(inputs, way: Reversal | Checkpoints):
-    problem, buffers = inputs
+def _forwards(problem: Problem, buffers):
     # The two passes of a gradient were measured to gain nothing by it.
     return as_one_function(lambda: _outputs(problem, buffers, run(problem)))
+
+
+@eqx.filter_custom_vjp
+def _solve(inputs, way: Reversal | Checkpoints):
+    return _forwards(*inputs)
 
 
 def _outputs(problem: Problem, buffers, out):
@@ -310,11 +293,7 @@ def _outputs(problem: Problem, buffers, out):
 def _solve_fwd(perturbed, inputs, way: Reversal | Checkpoints):
     moved, (problem, buffers) = perturbed[0], inputs
     if any(jtu.tree_leaves((moved.steps, moved.rows, moved.subs))):
-        raise ValueError(
-            "`FixedStepAdjoint` does not support derivatives with respect to times "
-            "(`t0`, `t1`, `dt0`, `ts`). Use `diffrax.RecursiveCheckpointAdjoint()` "
-            "instead."
-        )
+        raise ValueError(_TIMES)
     out = run(problem, way.track(problem))
     return _outputs(problem, buffers, out), out[1]
 

@@ -240,6 +240,7 @@ class Gradient:
 GRADIENTS = [
     Gradient("reversal", dps.FixedStepAdjoint, True),
     Gradient("checkpoints", lambda: dps.FixedStepAdjoint("checkpoints"), True),
+    Gradient("forward mode", lambda: dps.FixedStepAdjoint("forward"), True),
     Gradient("Diffrax's checkpoints", dfx.RecursiveCheckpointAdjoint, False),
-    Gradient("forward mode", dfx.ForwardMode, False),
+    Gradient("Diffrax's forward mode", dfx.ForwardMode, False),
 ]
