@@ -95,7 +95,7 @@ def check_order(run: Run, claimed: float, rounding: float):
         least = max(least, 12)
     numbers = [n for n in NUMBERS if n >= least]
     if run.way.prescribed:
-        numbers = [12, 16, 24]
+        numbers = [8, 12, 16, 24]
     if run.way.between:  # Multiples, so that steps of all spans become shorter.
         numbers = [6, 12, 18, 24, 36, 48, 72, 96, 144, 192]
     if "density" in run.way.name:
@@ -115,7 +115,7 @@ def check_order(run: Run, claimed: float, rounding: float):
     # depend on where the last step, or that of the kink, ends.
     uneven = run.row["friction"].kind == "drag" and run.row["system"].size == 1
     uneven |= run.row["scheme"].name.startswith("Tao") or "density" in run.way.name
-    uneven |= run.way.between
+    uneven |= run.way.between or run.way.prescribed  # as those between saved times
     number = 6 if uneven else 3
     last = sorted(errors)[-number:]
     drop = (last[-1] / last[0]) ** claimed
