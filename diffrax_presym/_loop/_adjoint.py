@@ -84,8 +84,7 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     inverse, steps between kept states are computed again instead; the memory grows with
     the square root of their number. For second derivatives use forward mode over
     reverse mode, `jax.jvp` of `jax.grad`. Forward mode alone, `jax.jvp` and
-    `jax.jacfwd`, is by `gradient="forward"`: for many outputs of few inputs, at the
-    cost of about two solves for each of them.
+    `jax.jacfwd`, is by `gradient="forward"`: for many outputs of few inputs.
     """
 
     gradient: Literal["reversal", "checkpoints", "forward"] | None = None

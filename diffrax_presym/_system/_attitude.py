@@ -16,9 +16,9 @@ from ._manifolds import AbstractManifold, Both, inner, size
 _CROSS = np.cross(np.eye(3)[:, None], np.eye(3)).T
 
 
-_TENSOR = (
-    " Of an inertia tensor write the eigenvalues, of `jnp.linalg.eigh`, whose "
-    "eigenvectors are the axes of the body."
+_DIAGONALISE = (
+    " Diagonalise a matrix, `jnp.linalg.eigh`, and write positions in the body along "
+    "its eigenvectors."
 )
 
 
@@ -57,12 +57,11 @@ class Attitude(AbstractManifold):
         - `inertia`: the three principal moments of inertia, positive, in any order; for
             several bodies of shape `(n, 3)`.
         """
-        self.inertia = as_positive(inertia, "`Attitude(inertia)`", _TENSOR)
+        self.inertia = as_positive(inertia, "`Attitude(inertia)`", _DIAGONALISE)
         if jnp.shape(self.inertia)[-1:] != (3,):
             raise ValueError(
                 "`Attitude(inertia)` needs three principal moments, but got the shape "
-                f"{jnp.shape(self.inertia)}. Diagonalise a matrix, `jnp.linalg.eigh`, "
-                "and write positions in the body along its eigenvectors."
+                f"{jnp.shape(self.inertia)}.{_DIAGONALISE}"
             )
 
     @property

@@ -6,7 +6,7 @@ import numpy as np
 
 import diffrax_presym as dps
 
-from ._system import energy, JUMP, mechanical, SPLIT, System, TWO
+from ._system import energy, JUMP, MASS, mechanical, PLANE, SPLIT, System, TWO
 
 
 def _push(t):
@@ -59,20 +59,18 @@ def _mixed_force(t, q, p):
     return -(1 + p @ p) * q - _push_numpy(t) * np.array([p[1], 0])
 
 
-_MASS = np.array([[2.0, 0.3], [0.3, 1.0]])
 _BODIES = np.array([[1.0], [1.5]])
-_PLANE = np.array([[1.0, 0.2], [-0.5, 0.3]]), np.array([[0.1, 0.5], [0.2, -0.4]])
 
 JUMPING = [
     System(
-        *("jumping force", mechanical(dps.QuadraticKinetic(_MASS), _potential)),
-        *(_force(1), TWO, _MASS),
+        *("jumping force", mechanical(dps.QuadraticKinetic(MASS), _potential)),
+        *(_force(1), TWO, MASS),
         jumps=True,
     ),
     System(
         "bodies, jumping force",
         mechanical(dps.QuadraticKinetic(_BODIES), _potential),
-        *(_force(2), _PLANE, np.diag([1.0, 1.0, 1.5, 1.5])),
+        *(_force(2), PLANE, np.diag([1.0, 1.0, 1.5, 1.5])),
         bodies=True,
         jumps=True,
     ),

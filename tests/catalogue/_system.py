@@ -20,6 +20,8 @@ RATE = ALL | {"shared"}
 LINEAR = RATE | {"linear"}
 ANY = frozenset({"any"})
 NYSTROM = ANY | {"nystrom"}
+MASS = np.array([[2.0, 0.3], [0.3, 1.0]])
+PLANE = np.array([[1.0, 0.2], [-0.5, 0.3]]), np.array([[0.1, 0.5], [0.2, -0.4]])
 TWO = np.array([1.0, -0.4]), np.array([0.3, 0.5])
 
 

@@ -14,8 +14,10 @@ from ._system import (
     ANY,
     energy,
     LINEAR,
+    MASS,
     mechanical,
     one_law,
+    PLANE,
     SPLIT,
     System,
     TWO,
@@ -204,10 +206,8 @@ def _quartic(t, q, p, args):
 
 
 _quadratic = dps.QuadraticKinetic
-_MASS = np.array([[2.0, 0.3], [0.3, 1.0]])
 _SPRINGS = np.array([[1.5, 0.2], [0.2, 1.0]])
 _ONE = np.array([1.1]), np.array([0.4])
-_PLANE = np.array([[1.0, 0.2], [-0.5, 0.3]]), np.array([[0.1, 0.5], [0.2, -0.4]])
 _TREE = (
     {"a": np.array([0.7, -0.2]), "b": np.array([[0.5, 0.9]])},
     {"a": np.array([0.2, 0.1]), "b": np.array([[-0.3, 0.4]])},
@@ -217,14 +217,14 @@ _POSITIVE = np.array([0.8, 1.4]), np.array([0.3, -0.2])
 _coupled_by = lambda kinetic: mechanical(kinetic, _coupled)
 _bodies = mechanical(_quadratic(np.array([[1.0], [1.5]])), _pair)
 _springs = dps.QuadraticPotential(_SPRINGS)
-_field = mechanical(_quadratic(_MASS), dps.ForceField(_whirl))
+_field = mechanical(_quadratic(MASS), dps.ForceField(_whirl))
 _own = energy(_quartic, splits=(own.QuarticSplit(),))
 
 SYSTEMS = [
     System("pendulum", unit_mass(_pendulum), _pendulum_force, _ONE, bodies=True),
-    System("mass matrix", _coupled_by(_quadratic(_MASS)), _coupled_force, mass=_MASS),
+    System("mass matrix", _coupled_by(_quadratic(MASS)), _coupled_force, mass=MASS),
     System(
-        *("bodies", _bodies, _pair_force, _PLANE),
+        *("bodies", _bodies, _pair_force, PLANE),
         mass=np.diag([1.0, 1.0, 1.5, 1.5]),
         bodies=True,
     ),
@@ -232,8 +232,8 @@ SYSTEMS = [
     System("chain of 20", unit_mass(_chain), _chain_force, _LONG, bodies=True),
     System("pytree", unit_mass(_tree), _tree_force, _TREE, bodies=True),
     System(
-        *("linear", mechanical(_quadratic(_MASS), _springs), _spring_force),
-        mass=_MASS,
+        *("linear", mechanical(_quadratic(MASS), _springs), _spring_force),
+        mass=MASS,
         offers=LINEAR,
     ),
     System(
@@ -284,7 +284,7 @@ SYSTEMS = [
         takes="none",
         start=1.0,
     ),
-    System("force field", _field, _whirl_force, mass=_MASS),
+    System("force field", _field, _whirl_force, mass=MASS),
     System(
         *("own split", _own, lambda t, q, p: -(q**3), TWO, None),
         velocity=lambda t, q, p, eta: p,
