@@ -299,7 +299,10 @@ def _solve_fwd(perturbed, inputs, way: Reversal | Checkpoints):
 
 @_solve.def_bwd
 def _solve_bwd(trace, bars, perturbed, inputs, way: Reversal | Checkpoints):
-    problem, buffers = inputs
+    # JAX passes what is known, as a number of a law of friction, as one of Python.
+    trace, (problem, buffers) = jtu.tree_map(
+        lambda x: jnp.asarray(x) if isinstance(x, float) else x, (trace, inputs)
+    )
     problem = eqx.tree_at(lambda problem: problem.rows, problem, trace.rows)
     (_, carry_bar), saved_bars, *_ = bars
     zeros = lambda like, bar: jtu.tree_map(

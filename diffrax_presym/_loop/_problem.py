@@ -7,6 +7,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Int, PyTree
 
 from .. import _tree as tree
@@ -21,6 +22,20 @@ from ._rows import Row, Rows
 from ._steps import Steps
 from ._variable import VariableSteps
 from ._within import End, end_of_step
+
+
+class _Traced(eqx.Module):
+    """A function, traced once, that returns arrays."""
+
+    fn: Callable[..., PyTree]
+
+    def __init__(self, fn: Callable[..., PyTree], *args: PyTree):
+        self.fn = eqx.filter_closure_convert(fn, *args)
+
+    def __call__(self, *args: PyTree) -> PyTree:
+        # What is known as it is traced, as a number of a user's law of friction, is a
+        # number of Python here, which has no cotangent.
+        return jtu.tree_map(jnp.asarray, self.fn(*args))
 
 
 class Functions(eqx.Module):
@@ -88,7 +103,7 @@ class Problem(eqx.Module):
 
         self.rows = [Rows(sub, steps, max_steps) for sub in subs]
         some = any(rows.may_be_inside for rows in self.rows)
-        convert = eqx.filter_closure_convert
+        convert = _Traced
         # Where steps end is differentiated as part of the functions.
         self.steps, self.max_steps = steps.without_gradient(), max_steps
         self.stencils = [None] * len(self.rows)
