@@ -47,7 +47,7 @@ HAMILTONIANS = {
     "massless particles": (lambda: dps.QuadraticKinetic(jnp.array([1.0, 0.0])),
         "massless test particles", "ForceField"),
     "mass that is a function": (lambda: dps.QuadraticKinetic(lambda q: q),
-        f"{MASS} must be", "a real number", "`LagrangianSystem`"),
+        f"{MASS} must be", "a real number", "`LagrangianSystem`", "`T(t, p, args)`"),
     "stiffness that is a function": (lambda: dps.QuadraticPotential(harmonic),
         "a real number", "function is passed", "`MechanicalSystem(kinetic, V)`"),
     "mass that is not symmetric": (traced(kinetic=dps.QuadraticKinetic(ASYMMETRIC)),

@@ -35,13 +35,18 @@ def find_split(
             "`TunedRKN6()`, `BlanesMoan6()` or `PresymplecticGauss()`."
         )
     if kind == "separable":
-        explicit = "`Strang()` or `BlanesMoan4()`, which are explicit, or "
-        instead = "" if system.split("any") is None else explicit
+        if system.split("any") is not None:
+            raise ValueError(
+                f"`{name}` would be implicit for this `{system.name}`. It is explicit "
+                "for rates of friction, and with `QuadraticKinetic` for matrices, that "
+                "depend on time alone, and without a `force=f` of the velocity. Use "
+                "`Strang()` or `BlanesMoan4()`, or `PresymplecticGauss()`."
+            )
         raise ValueError(
             f"This `{system.name}` is not separable, so `{name}` would be implicit. If "
             "the energy is a sum T(t, p) + V(t, q), give its parts: "
             "`MechanicalSystem(kinetic, potential)`. Otherwise use "
-            f"{instead}`PresymplecticGauss()`."
+            "`PresymplecticGauss()`."
         )
     if system.split("any") is None:
         raise ValueError(

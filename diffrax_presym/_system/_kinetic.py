@@ -88,7 +88,8 @@ AbstractKinetic.__init__.__doc__ = "**Arguments:** its fields, if any."
 
 
 _OF_POSITIONS = (
-    " For a mass matrix that depends on the positions write `LagrangianSystem`."
+    " For a mass matrix that depends on the positions write `LagrangianSystem`, for a "
+    "mass that depends on time the kinetic energy as a function `T(t, p, args)`."
 )
 
 
