@@ -162,6 +162,37 @@ def matvec(matrix: Array, x: Array) -> Array:
     return jnp.sum(matrix * x[..., None, :], axis=-1)
 
 
+# A loop over matrices copies each before XLA on a CPU calls its product, but not before
+# a sum, which is 1.3 to 2.6 times faster up to these sizes, and in a batch 1.2 to 2
+# times up to the first of them.
+_SUMMED, _SUMMED_ALONE = 10, 32
+
+
+def vecmat(x: Array, matrix: Array) -> Array:
+    """A vector over the last axis, times a matrix for each that is one of many."""
+    if matrix.shape[-1] <= _SUMMED or jnp.ndim(x) > 1:
+        return jnp.sum(x[..., None] * matrix, axis=-2)
+    return _alone(x, matrix) if len(x) <= _SUMMED_ALONE else x @ matrix
+
+
+@jax.custom_jvp
+def _alone(x: Array, matrix: Array) -> Array:
+    product = jax.custom_batching.custom_vmap(lambda x, y: jnp.sum(x[:, None] * y, 0))
+
+    @product.def_vmap
+    def batched(size, is_batched, x, matrix):
+        axes = tuple(0 if each else None for each in is_batched)
+        return jax.vmap(jnp.matmul, axes)(x, matrix), True
+
+    return product(x, matrix)
+
+
+@_alone.defjvp
+def _alone_jvp(primals, tangents):
+    (x, matrix), (dx, d_matrix) = primals, tangents
+    return _alone(x, matrix), dx @ matrix + x @ d_matrix
+
+
 def multiply(
     form, x: PyTree, name: str, state: str, symmetric=True, product=operator.mul
 ) -> PyTree:

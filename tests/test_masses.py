@@ -85,24 +85,31 @@ def test_masses(mass, p, expected):
     assert_close(velocity, jax.grad(kinetic, 1)(T, p), 1e-14)
 
 
-@pytest.mark.variants(1)
+@pytest.mark.variants(2)
 @pytest.mark.parametrize("constrained", [False, True])
 @pytest.mark.parametrize("n", [3, 10, 20])
-def test_a_matrix_is_factorised_once(n, constrained):
+@pytest.mark.parametrize("by_place", [False, True])
+def test_a_matrix_is_factorised_once(n, constrained, by_place):
     x = np.random.default_rng(0).normal(size=(n, n))
     M, q = jnp.asarray(np.eye(n) + 0.1 * x @ x.T / n), jnp.linspace(0.5, 1.0, n)
 
-    def end(M, adjoint=None):
-        kinetic, drag = dps.QuadraticKinetic(M), dps.ViscousDamping(0.1)
-        system: Any = dps.MechanicalSystem(kinetic, harmonic, drag)
+    law = dps.ViscousDamping((lambda t, q, args: q**2) if by_place else 0.1)
+
+    def end(M, adjoint=None, law: Any = law):
+        kinetic = dps.QuadraticKinetic(M)
+        system: Any = dps.MechanicalSystem(kinetic, harmonic, law)
         if constrained:
             system = dps.ConstrainedSystem(system, lambda t, q, args: q[:2] - 0.5)
         y0 = system.project(0.0, (q.at[:2].set(0.5), 1 - q))
-        solver = dps.Strang() if constrained else dps.TunedRKN6()
+        solver = dps.Strang() if constrained or by_place else dps.TunedRKN6()
         adjoint = adjoint or dps.FixedStepAdjoint()
         sol = solve(system, solver, 0.0, 1.0, 0.1, y0, adjoint=adjoint)
         return jax.tree.map(lambda x: x[-1], sol.ys)
 
+    if by_place:  # Not again for the friction at each place.
+        with_law = lambda law: jax.make_jaxpr(lambda M: end(M, law=law))(M)
+        count = lambda law: str(with_law(law)).count("cholesky")
+        assert count(law) == count(None)
     assert_close(end(M), end(M, dfx.RecursiveCheckpointAdjoint()), 1e-13)
     slope = jax.grad(lambda M: jnp.sum(end(M)[0] ** 2))(M)
     change = jnp.asarray(x + x.T)

@@ -15,6 +15,7 @@ import scipy.linalg
 from helpers import assert_close, flat, harmonic, solve, step
 
 import diffrax_presym as dps
+from diffrax_presym._forms import vecmat
 from diffrax_presym._friction._exponential import (
     exponential,
     exponential_products,
@@ -212,6 +213,47 @@ def test_exponential_products_and_their_derivatives(scale):
     found = sum(jnp.sum(g * dy) for g, dy in zip(slopes, along, strict=True))
     np.testing.assert_allclose(found, wanted, rtol=1e-7, atol=1e-8)
     np.testing.assert_allclose(jax.jvp(total, at, along)[1], found, rtol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_as_many_terms_as_the_size_of_a_matrix_needs(dtype):
+    x, unit = Y0[0].astype(dtype), (C / np.linalg.norm(C, 1)).astype(dtype)
+    find = jax.jit(lambda h: exponential_products(unit, h, x))
+    for size in np.logspace(-18, 0.3, 60):
+        h = jnp.asarray(size, dtype)
+        series, term, generator = np.zeros(3), np.asarray(x, float), -np.asarray(unit)
+        for k in range(30):
+            series += term / (k + 1)
+            term = float(h) * generator.astype(float) @ term / (k + 1)
+        change, integral = (np.asarray(y, float) for y in find(h))
+        wanted = generator.astype(float) @ series
+        atol = 8 * float(jnp.finfo(dtype).eps) * np.max(np.abs(x))
+        np.testing.assert_allclose(change / float(h), wanted, rtol=0, atol=atol)
+        np.testing.assert_allclose(integral / float(h), series, rtol=0, atol=atol)
+
+
+@pytest.mark.variants(4)
+@pytest.mark.parametrize("axes", [(None, None), (0, None), (None, 0), (0, 0)])
+@pytest.mark.parametrize("n", [1, 10, 11, 32, 33])
+def test_a_vector_times_one_of_many_matrices(n, axes):
+    """Alone and in a batch, with derivatives by both, against NumPy."""
+    rng = np.random.default_rng(n)
+    x, matrix = rng.normal(size=(2, n)), rng.normal(size=(2, n, n))
+    dx, d_matrix = rng.normal(size=x.shape), rng.normal(size=matrix.shape)
+    at = lambda *xs: [
+        jnp.asarray(x if i == 0 else x[0]) for x, i in zip(xs, axes, strict=True)
+    ]
+    product = jax.vmap(vecmat, axes) if axes != (None, None) else vecmat
+    primals, tangents = at(x, matrix), at(dx, d_matrix)
+    found, slope = jax.jvp(product, primals, tangents)
+    rows = lambda *xs: np.einsum("...j,...jk->...k", *xs)
+    wanted = rows(tangents[0], primals[1]) + rows(primals[0], tangents[1])
+    np.testing.assert_allclose(found, rows(*primals), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(slope, wanted, rtol=0, atol=1e-13)
+    pulled = jax.vjp(product, *primals)[1](found)
+    both = zip(pulled, tangents, strict=True)
+    total = sum(jnp.sum(g * d) for g, d in both)
+    np.testing.assert_allclose(total, np.sum(found * slope), rtol=1e-11)
 
 
 @pytest.mark.parametrize("size", [5.0, 11.0, 14.0])

@@ -30,11 +30,13 @@ class Mechanics(NamedTuple):
     - `has_mass`: whether the mass is known.
     - `mass_varies`: whether it depends on positions or momenta, as the mass of joints
         or of relativistic particles: no drift is exact.
+    - `inverse`: that of the mass, if that has a matrix and the inverse is known.
     """
 
     mass: Any = None
     has_mass: bool = True
     mass_varies: bool = False
+    inverse: Any = None
 
 
 class LinearPart(NamedTuple):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Inexact
 
-from .._forms import matvec
+from .._forms import matvec, vecmat
 from .._numbers import cast_to
 
 
@@ -97,7 +97,7 @@ def exponentials(
     z = -unit * matrix
     one = jnp.broadcast_to(jnp.eye(z.shape[-1], dtype=z.dtype), z.shape)
     # Loops rather than code for each term, which takes long to compile.
-    next_power = lambda x, _: (_product(x, z), x)
+    next_power = lambda x, _: (product(x, z), x)
     _, powers = lax.scan(next_power, one, None, length=_TERMS + 1)
     # x^k / (k + 1)!, by their ratios.
     numbers = np.arange(_TERMS, dtype=z.dtype)[None]
@@ -116,8 +116,8 @@ def exponentials(
         def doubled(x):
             change, mean = x
             # (e^z - 1)(e^z + 1), and the mean of e^(sz) over s from 0 to 2.
-            square = _product(change, change)
-            return change + change + square, mean + _product(mean, change / 2)
+            square = product(change, change)
+            return change + change + square, mean + product(mean, change / 2)
 
         return lax.cond(i < halvings, doubled, lambda x: x, x), None
 
@@ -139,7 +139,7 @@ def exponential(matrix: Inexact[Array, "n n"]) -> Inexact[Array, "n n"]:
     return jnp.eye(len(matrix), dtype=matrix.dtype) + change[0]
 
 
-def _product(x: Array, y: Array) -> Array:
+def product(x: Array, y: Array) -> Array:
     if x.shape[-1] <= _MOST_SUMMED:
         return jnp.sum(x[..., None] * jnp.expand_dims(y, -3), axis=-2)
     return jnp.matmul(x, y, precision="highest")
@@ -155,10 +155,14 @@ def exponential_products(
     many parts of the time as it needs."""
     parts = _parts(matrix, time)
     part = time / parts
+    size, rounding = _norm(matrix) * jnp.abs(part), float(jnp.finfo(x.dtype).eps)
+    # Those of which the next is below rounding, relative to the first.
+    small = [(rounding * math.factorial(k)) ** (1 / k) for k in range(1, _TERMS)]
+    terms = 1 + jnp.sum(size > np.asarray(small, x.dtype))
 
     def advance(state):
         i, change, integral = state
-        more = _short(matrix, part, x + change)
+        more = _short(matrix, part, x + change, terms)
         return i + 1, change + more[0], integral + more[1]
 
     start = jnp.zeros_like(parts), jnp.zeros_like(x), jnp.zeros_like(x)
@@ -172,16 +176,20 @@ def _parts(matrix: Array, time: Array) -> Array:
     return jnp.maximum(jnp.ceil(2 * _norm(matrix) * jnp.abs(time)), 1)
 
 
-def _short(matrix: Array, time: Array, x: Array) -> tuple[Array, Array]:
-    def term(state, k):
+def _short(
+    matrix: Array, time: Array, x: Array, terms: Array | int = _TERMS
+) -> tuple[Array, Array]:
+    transposed = jnp.swapaxes(matrix, -1, -2)
+
+    def term(i, state):
         last, change, integral = state
-        integral = integral + last * (time / k)
-        last = matvec(matrix, last) * (-time / k)
-        return (last, change + last, integral), None
+        part = time / (i + 1).astype(time.dtype)
+        integral = integral + last * part
+        last = vecmat(last, transposed) * -part
+        return last, change + last, integral
 
     zero = jnp.zeros_like(x)
-    numbers = np.arange(1, _TERMS + 1, dtype=x.dtype)
-    return lax.scan(term, (x, zero, zero), numbers)[0][1:]
+    return lax.fori_loop(0, terms, term, (x, zero, zero))[1:]
 
 
 @exponential_products.defjvp

@@ -21,6 +21,7 @@ from ._base import (
     Parts,
 )
 from ._damping import AbstractDamping, SumOfDampings
+from ._exponential import product
 from ._leaf import EntryFriction, MatrixFriction
 from ._linear import LinearFriction
 from ._log_scale import AbstractLogScale
@@ -50,7 +51,8 @@ def _rates(part: LinearPart, mechanics: Mechanics, p: PyTree) -> list[Array]:
     rates = jtu.tree_leaves(fit_form(form, p, name, "p"))
     if part.per_velocity:
         mass = fit_form(_as_array(mechanics.mass, p, MASS), p, MASS, "p")
-        rows = zip(rates, jtu.tree_leaves(mass), like, strict=True)
+        inverse = jtu.tree_leaves(mechanics.inverse) or [None] * len(like)
+        rows = zip(rates, jtu.tree_leaves(mass), inverse, like, strict=True)
         return [_per_momentum(*row) for row in rows]
     couples = any(is_matrix(x, xi) for x, xi in zip(rates, like, strict=True))
     if couples and not part.may_couple:
@@ -121,12 +123,19 @@ def _check_values(law: AbstractLogScale, like: Array) -> None:
     fit_form(jnp.zeros(shape), like, DAMPING, "p")
 
 
-def _per_momentum(coefficient: Array, mass: Array, p: Array) -> Array:
+def _per_momentum(
+    coefficient: Array, mass: Array, inverse: Array | None, p: Array
+) -> Array:
     """C M^-1 for one leaf."""
     if not is_matrix(mass, p):
         if is_matrix(coefficient, p):
             return coefficient / jnp.broadcast_to(mass, jnp.shape(p))[..., None, :]
         return coefficient / mass
+    if inverse is not None:
+        # In every kick, of coefficients that depend on the place: no factorisation.
+        if is_matrix(coefficient, p):
+            return product(coefficient, inverse)
+        return jnp.broadcast_to(coefficient, jnp.shape(p))[..., None] * inverse
     # M is symmetric: C M^-1 is the transpose of M^-1 C^T.
     transposed = jnp.swapaxes(_as_matrix(coefficient, p), -1, -2)
     factor = jnp.linalg.cholesky(mass)

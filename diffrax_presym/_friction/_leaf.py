@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Inexact
 
-from .._forms import matvec
+from .._forms import matvec, vecmat
 from .._numbers import as_time, cast_to, Scalar, Time
 from ._exponential import exponential_products, exponentials
 from ._log_scale import AbstractLogScale, by_quadrature, Effect, increment, Terms
@@ -152,12 +152,13 @@ class MatrixFriction(eqx.Module):
         both = exponentials(matrix, jnp.concatenate(list(map(jnp.ravel, times))))
         ends = np.cumsum([x.size for x in times])[:-1]
         parts = zip(times, *(jnp.split(y, ends) for y in both), strict=True)
-        shape = lambda x, y: y.reshape(*x.shape, *matrix.shape)
+        # Transposed, as a sum over the first axis is the faster one.
+        shape = lambda x, y: y.reshape(*x.shape, *matrix.shape).swapaxes(-1, -2)
         return [Effect(shape(x, a), shape(x, b), shape(x, b)) for x, a, b in parts]
 
     def flow(self, effect: Effect, p: Array) -> tuple[Array, Array]:
         if jnp.ndim(effect.change):
-            change, carried = (matvec(cast_to(x, p), p) for x in effect[:2])
+            change, carried = (vecmat(p, cast_to(x, p)) for x in effect[:2])
             return change, carried
         matrix, time = cast_to(self.matrix, p), cast_to(effect.change, p)
         return exponential_products(matrix, time, p)

@@ -104,7 +104,7 @@ class MechanicalSystem(AbstractSystem):
     @property
     def mechanics(self) -> Mechanics:
         if isinstance(self.kinetic, QuadraticKinetic):
-            return Mechanics(self.kinetic.mass)
+            return Mechanics(self.kinetic.mass, inverse=self.kinetic.inverse)
         return Mechanics(mass_varies=True)
 
     def factorised(self, p: P) -> "MechanicalSystem":
