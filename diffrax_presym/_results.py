@@ -40,18 +40,28 @@ NOT_CONVERGED = _entry(
     "fixed_point_not_converged",
     "The fixed-point iteration of `PresymplecticGauss` did not converge in a step, or "
     "left the finite numbers: the step times the largest frequency of the system is "
-    "too large, or its friction is strong. Take shorter steps, or pass a root finder: "
+    "too large, its friction is strong, or its mass matrix is not positive definite. "
+    "Take shorter steps, or pass a root finder: "
     "`PresymplecticGauss(stages, optimistix.Newton(rtol, atol))`. With `throw=False` "
     "the last finite time in `ts` of `SaveAt(steps=True)` is the end of that step.",
 )
 FORCE_NOT_SOLVED = _entry(
     "force_not_solved",
     "The equation of a kick by a `force` of the velocity was not solved, or the state "
-    "left the finite numbers: the force is too stiff for the step, whose length times "
-    "its slope by momentum must be below about 2. Take shorter steps; write what is "
-    "linear in the velocity as `friction=ViscousDamping(C)`, also with a function "
-    "`C(t, q, args)`; or use `PresymplecticGauss(stages, optimistix.Newton(rtol, "
-    "atol))`, but on manifolds.",
+    "left the finite numbers, as by a parameter that is NaN. Otherwise the force is "
+    "too stiff for the step, whose length times its slope by momentum must be below "
+    "about 2. Take shorter steps; write what is linear in the velocity as "
+    "`friction=ViscousDamping(C)`, also with a function `C(t, q, args)`; or use "
+    "`PresymplecticGauss(stages, optimistix.Newton(rtol, atol))`, but on manifolds.",
+)
+ENERGY_NOT_DEFINED = _entry(
+    "energy_not_defined",
+    "At the end of a step, whose state is finite, the energy is not defined: the mass "
+    "matrix of `LagrangianSystem` is not symmetric to rounding, or not positive "
+    "definite; or positions of `BregmanHamiltonian` are outside of the domain of its "
+    "mirror map, or its rates do not satisfy the conditions. Evaluate these at `y0`, "
+    "and at the last finite state, of `SaveAt(steps=True)` with `throw=False`; if the "
+    "state left the domain, take shorter steps.",
 )
 ROOT_NOT_FOUND = _entry(
     "root_not_found",

@@ -116,6 +116,9 @@ TERMS = {
         "`BlanesMoan6()` or `PresymplecticGauss"),
     "force of an energy": (on(WITH_FORCE, dps.Strang()),
         "give its parts: `MechanicalSystem"),
+    "a solver of Diffrax in the loop of the package": (
+        lambda: trace(ODE, dfx.Tsit5(), adjoint=dps.FixedStepAdjoint()),
+        "does not support `Tsit5`", "`diffrax.RecursiveCheckpointAdjoint()`"),
     "the adjoint of Diffrax with the same solver": (backsolve, "`BacksolveAdjoint()`",
         "not Hamiltonian", "`BacksolveAdjoint(solver=diffrax.Tsit5())`"),
 }  # fmt: skip
@@ -124,6 +127,13 @@ TERMS = {
 @raising(TERMS)
 def test_terms(act, parts):
     check(act, parts)
+
+
+def test_a_function_of_the_velocity_as_friction():
+    with pytest.raises(IndexError) as error:
+        trace(mechanics(friction=lambda v: v[0]), LEAPFROG)
+    assert "is called as `eta(t)`" in error.value.__notes__[0]
+    assert "`force=f`" in error.value.__notes__[0]
 
 
 @pytest.mark.parametrize("solver", [LEAPFROG, dps.PresymplecticTao()])

@@ -220,6 +220,11 @@ class Power(AbstractLogScale):
 
 _LAWS = " A law of friction is passed with its numbers: `ConstantDamping(rate)`."
 
+_OF_TIME = (
+    "A function given as `friction` is called as `eta(t)`, with the time. One of the "
+    "velocity is written as `force=f`, with `f(t, q, v, args)`."
+)
+
 
 class FunctionOfTime(AbstractLogScale):
     """Any function `eta(t)`; its increments are plain differences."""
@@ -228,7 +233,12 @@ class FunctionOfTime(AbstractLogScale):
     is_autonomous: ClassVar[bool] = False
 
     def __call__(self, t: Time) -> Inexact[Array, "..."]:
-        value = as_parameter(self.eta(t), "The value of `eta(t)`", _LAWS)
+        try:
+            value = self.eta(t)
+        except Exception as error:
+            error.add_note(_OF_TIME)
+            raise
+        value = as_parameter(value, "The value of `eta(t)`", _LAWS)
         return cast_to(value, as_time(t))
 
     def increment(self, t: Time, h: Time) -> Inexact[Array, "..."]:

@@ -126,6 +126,8 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         passed_controller_state,
         progress_meter,
     ):
+        unsupported = event, saveat, passed_controller_state
+        check_supported(solver, stepsize_controller, *unsupported)
         subs, structure = private.flatten_subs(saveat)
         if self.gradient == "forward":
             fixed = partial(eqxi.nondifferentiable, msg=_TIMES)
@@ -138,8 +140,6 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
         # Of friction at a place it has the user's objects, whose fields may be numbers.
         carry = jtu.tree_map(jnp.asarray, carry)
         system = bind(terms, args, y).factorised(y)
-        unsupported = event, saveat, passed_controller_state
-        check_supported(solver, stepsize_controller, *unsupported)
         scheme = solver.scheme(system)
         check_history(solver, scheme, stepsize_controller)
         way = self._way(solver, scheme, (y, carry), max_steps, throw)

@@ -40,7 +40,8 @@ def find_split(
                 f"`{name}` would be implicit for this `{system.name}`. It is explicit "
                 "for rates of friction, and with `QuadraticKinetic` for matrices, that "
                 "depend on time alone, and without a `force=f` of the velocity. Use "
-                "`Strang()` or `BlanesMoan4()`, or `PresymplecticGauss()`."
+                "`Strang()` or `BlanesMoan4()`, which are explicit, or "
+                "`PresymplecticGauss()`."
             )
         raise ValueError(
             f"This `{system.name}` is not separable, so `{name}` would be implicit. If "
@@ -59,6 +60,7 @@ def find_split(
         f"`{name}` keeps its order only for a quadratic kinetic energy, written as "
         "`QuadraticKinetic(mass)`, or a quadratic potential, written as "
         "`QuadraticPotential(stiffness)`; and for friction that depends neither on "
-        "positions nor on the speed, without a `force=f` of the velocity. Otherwise "
-        "use `Strang()`, `BlanesMoan4()`, `BlanesMoan6()` or `PresymplecticGauss()`."
+        "positions nor on the speed, nor is a function `C(t, q, args)`, without a "
+        "`force=f` of the velocity. Otherwise use `Strang()`, `BlanesMoan4()`, "
+        "`BlanesMoan6()` or `PresymplecticGauss()`."
     )

@@ -239,10 +239,12 @@ def _exceeds(law: Law | None, max_steps: int, needed: float = math.inf) -> str:
     elif not order >= law.least - 0.4:
         what = f"found no regular convergence with up to {tried} steps"
         advice = (
-            "Check that the motion is not chaotic, the tolerance above rounding, and "
-            "the force smooth: if it has kinks or jumps at known times, write "
-            "`stepsize_controller=StepsBetween(times)`; otherwise use a shorter time "
-            "span, a larger tolerance or, for many fast periods, a larger `max_steps`."
+            "Check that the motion is not chaotic, the tolerance above rounding, the "
+            "`tolerance` of `PresymplecticGauss` or of a root finder small enough for "
+            "so many steps, and the force smooth: if it has kinks or jumps at known "
+            "times, write `stepsize_controller=StepsBetween(times)`; otherwise use a "
+            "shorter time span, a larger tolerance or, for many fast periods, a larger "
+            "`max_steps`."
         )
     else:
         about = f"about {needed:.1e}, more" if needed < math.inf else "more"

@@ -13,7 +13,7 @@ from .. import _tree as tree
 from .._friction._base import Parts
 from .._friction._linear import LinearFriction
 from .._numbers import as_time, cast_to, State, Time
-from .._results import NONFINITE
+from .._results import ENERGY_NOT_DEFINED, NONFINITE
 from ._base import AbstractSystem
 from ._split import AbstractSplit
 
@@ -98,10 +98,13 @@ class System(eqx.Module):
 
     def check(self, t: Time, y: State) -> dfx.RESULTS | None:
         """A failure where the energy is not defined; `None` if that is not checked."""
-        valid = self.term.is_valid(t, *tree.values(y), self.args)
+        y = tree.values(y)
+        valid = self.term.is_valid(t, *y, self.args)
         if valid is None:
             return None
-        return dfx.RESULTS.where(valid, dfx.RESULTS.successful, NONFINITE)
+        where, finite = dfx.RESULTS.where, tree.all_finite(y)
+        failure = where(finite, ENERGY_NOT_DEFINED, NONFINITE)
+        return where(valid, dfx.RESULTS.successful, failure)
 
     # Friction.
 
