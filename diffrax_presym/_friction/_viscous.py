@@ -61,10 +61,12 @@ class ViscousDamping(AbstractFriction):
     energy is kept: the force `e v × B` on a charge `e` in a uniform magnetic field `B`,
     and the Coriolis force `-2 m Ω × v` in a frame that rotates with `Ω`.
 
-    With numbers or arrays the cost is that of `ConstantDamping`. With matrices and
-    equal steps, in the loop of `FixedStepAdjoint`, exponentials for all stages are
-    computed once for a solve, and a drift is two products with a matrix. Elsewhere a
-    drift takes about fifteen products, more under strong friction.
+    With numbers or arrays the cost is that of `ConstantDamping`, unless the mass is a
+    matrix that is not diagonal: then `C M^-1` is one too. With matrices and equal
+    steps, in the loop of `FixedStepAdjoint`, exponentials for all stages are computed
+    once for a solve, and a drift is two products with a matrix. Elsewhere, as with
+    `StepsBetween` and in Diffrax's own loop, a drift takes up to fifteen products, the
+    fewer the weaker the friction over it, and more if that is strong.
 
     Rayleigh damping, `C = α M + β K`, is a list of two laws: `[ConstantDamping(alpha),
     ViscousDamping(beta * K)]`.
@@ -72,7 +74,8 @@ class ViscousDamping(AbstractFriction):
     If `C` depends on time or place, by a function, the friction is part of the kicks,
     and exact there at fixed positions: as `PositionDamping`. With any other kinetic
     energy a kick solves an equation for the momentum, as for a `force=f`: use
-    `BlanesMoan4` or `BlanesMoan6`.
+    `BlanesMoan4` or `BlanesMoan6`, or over many turns in a magnetic field
+    `PresymplecticGauss(8)`.
 
     !!! example
 
