@@ -105,7 +105,7 @@ MUTANTS = [
         "first = jnp.maximum(first, low)", "first = jnp.maximum(first, 0)",
         tests="test_between_steps.py"),
     Mutant("values between steps are interpolated whatever the friction",
-        "_loop/_base.py", "most <= MOST_FRICTION", "most < jnp.inf",
+        "_loop/_base.py", "(start, h) <= most", "(start, h) < jnp.inf",
         tests="test_between_steps.py"),
     Mutant("a step back by a loose tolerance is to be exact", "_loop/_kept.py",
         "eps = max(eps, self.inverse_error)", "", tests="test_collocation.py",

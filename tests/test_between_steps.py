@@ -129,10 +129,11 @@ def test_never_across_a_kink():
     assert np.stack(sol.ys) == pytest.approx(np.stack(fine.ys), abs=1e-9)
 
 
-@pytest.mark.parametrize("gamma", [0.4, 4.0, 400.0])
+@pytest.mark.variants(4)
+@pytest.mark.parametrize("gamma", [0.4, 2.9, 4.0, 400.0])
 def test_strong_friction_takes_shorter_steps(gamma):
     sol = solve(RKN4, 40, gamma=gamma)
-    assert bool(sol.stats["interpolated"]) == (gamma == 0.4)
+    assert bool(sol.stats["interpolated"]) == (gamma < 3)
     if gamma == 400.0:
         assert sol.result == FRICTION_TOO_STRONG
         return

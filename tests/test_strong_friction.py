@@ -10,6 +10,7 @@ import pytest
 from helpers import assert_close, harmonic, solve
 
 import diffrax_presym as dps
+from diffrax_presym._friction._leaf import MatrixFriction
 from diffrax_presym._results import FRICTION_TOO_STRONG
 
 
@@ -195,3 +196,16 @@ def test_damping_soon_after_its_singular_start(solver):
     # The stages of a triple jump are before the start.
     outside = run(dps.SuzukiYoshida(4), throw=False)
     assert outside.result != dfx.RESULTS.successful
+
+
+@pytest.mark.parametrize("n", [3, 8])
+def test_the_fastest_decay_or_rotation_of_a_matrix(n):
+    rng = np.random.default_rng(n)
+    mass = np.eye(n) + rng.uniform(size=(n, n))
+    shear = np.array([[3.0, 1.0], [0.0, 1.0]])
+    coefficients = np.diag(rng.uniform(0.1, 1.0, n))
+    for matrix in (coefficients @ np.linalg.inv(mass @ mass.T), 0.0 * mass, shear):
+        largest = np.max(np.abs(np.linalg.eigvals(matrix)))
+        friction = MatrixFriction(jnp.asarray(matrix))
+        found = friction.fastest(jnp.asarray(0.0), jnp.asarray(-0.3))
+        assert 0.3 * largest <= found <= 0.3 * 1.5 * largest

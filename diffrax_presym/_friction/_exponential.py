@@ -88,7 +88,7 @@ def exponentials(
     known = jnp.isfinite(times)
     times = jnp.where(known, times, 0)
     longest = jnp.max(jnp.abs(times))
-    halvings = jnp.ceil(jnp.log2(jnp.maximum(2 * _norm(matrix) * longest, 1)))
+    halvings = jnp.ceil(jnp.log2(jnp.maximum(2 * norm(matrix) * longest, 1)))
     solvable = halvings <= _SQUARINGS
     halvings = jnp.where(solvable, halvings, 0)
     unit = jnp.where(longest == 0, 1, longest) * 2**-halvings
@@ -128,7 +128,7 @@ def exponentials(
     return valid(change), valid(expand(times) * mean)
 
 
-def _norm(matrix: Array) -> Array:
+def norm(matrix: Array) -> Array:
     return lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(matrix), axis=-2), initial=0))
 
 
@@ -155,7 +155,7 @@ def exponential_products(
     many parts of the time as it needs."""
     parts = _parts(matrix, time)
     part = time / parts
-    size, rounding = _norm(matrix) * jnp.abs(part), float(jnp.finfo(x.dtype).eps)
+    size, rounding = norm(matrix) * jnp.abs(part), float(jnp.finfo(x.dtype).eps)
     # Those of which the next is below rounding, relative to the first.
     small = [(rounding * math.factorial(k)) ** (1 / k) for k in range(1, _TERMS)]
     terms = 1 + jnp.sum(size > np.asarray(small, x.dtype))
@@ -173,7 +173,7 @@ def exponential_products(
 
 
 def _parts(matrix: Array, time: Array) -> Array:
-    return jnp.maximum(jnp.ceil(2 * _norm(matrix) * jnp.abs(time)), 1)
+    return jnp.maximum(jnp.ceil(2 * norm(matrix) * jnp.abs(time)), 1)
 
 
 def _short(

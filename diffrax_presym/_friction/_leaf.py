@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Inexact
 
 from .._forms import matvec, vecmat
 from .._numbers import as_time, cast_to, Scalar, Time
-from ._exponential import exponential_products, exponentials
+from ._exponential import exponential_products, exponentials, norm, product
 from ._log_scale import AbstractLogScale, by_quadrature, Effect, increment, Terms
 from ._near_singularity import by_powers
 from ._over_step import DecayOverStep
@@ -96,8 +96,8 @@ class EntryFriction(eqx.Module):
             return jnp.zeros_like(as_time(h))
         return jnp.max(increment(self.terms, t, h), initial=-jnp.inf)
 
-    def angle(self, h: Time) -> Scalar:
-        return jnp.zeros_like(as_time(h))
+    def fastest(self, t: Time, h: Time) -> Scalar:
+        return self.growth(t, h)
 
     def over(self, t: Time, h: Time) -> Scalar:
         each = jnp.abs(increment(self.terms, t, h))
@@ -132,6 +132,15 @@ class EntryFriction(eqx.Module):
 
     def is_singular(self, t: Time) -> Bool[Array, ""] | None:
         return reduce_any([law.is_singular(t) for law, _ in self.terms])
+
+    def of_motion_from(self, t: Time) -> "EntryFriction":
+        def seen(law: AbstractLogScale, rate: Array) -> Array:
+            here = law.is_singular(t) if law.strength else None
+            if here is None:
+                return rate
+            return jnp.where(here & (law.strength * rate > 0), 0, rate)
+
+        return EntryFriction(tuple((law, seen(law, x)) for law, x in self.terms))
 
 
 class MatrixFriction(eqx.Module):
@@ -183,10 +192,15 @@ class MatrixFriction(eqx.Module):
         forwards, backwards = most(symmetric), most(-symmetric)
         return jnp.where(h > 0, forwards, backwards) * jnp.abs(h)
 
-    def angle(self, h: Time) -> Scalar:
+    def fastest(self, t: Time, h: Time) -> Scalar:
         matrix = cast_to(self.matrix, h := as_time(h))
-        turning = jnp.abs(matrix - jnp.swapaxes(matrix, -1, -2)) / 2
-        return jnp.max(jnp.sum(turning, axis=-1), initial=0) * jnp.abs(h) / 2
+        size = jnp.maximum(norm(matrix), float(jnp.finfo(h.dtype).tiny))
+        power = matrix / size
+        for _ in range(3):
+            power = product(power, power)
+        # Of a power it is close to the largest eigenvalue, where that of the matrix may
+        # be several times as large.
+        return size * norm(power) ** (1 / 8) * jnp.abs(h)
 
     def over(self, t: Time, h: Time) -> Scalar:
         matrix = cast_to(self.matrix, h := as_time(h))
@@ -207,6 +221,9 @@ class MatrixFriction(eqx.Module):
 
     def is_singular(self, t: Time) -> None:
         return None
+
+    def of_motion_from(self, t: Time) -> "MatrixFriction":
+        return self
 
 
 def _times(factor: Scalar, x: Array) -> Array:

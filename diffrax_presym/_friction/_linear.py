@@ -116,9 +116,10 @@ class LinearFriction(eqx.Module):
         `t`."""
         return self._largest(lambda leaf: leaf.growth(t, h))
 
-    def angle(self, h: Time) -> Scalar:
-        """At least half of the angle by which momenta turn over a span."""
-        return self._largest(lambda leaf: leaf.angle(h))
+    def fastest(self, t: Time, h: Time) -> Scalar:
+        """The logarithm of the factor by which the fastest decay changes a momentum
+        over a span, or the angle of the fastest rotation; or a bound of them."""
+        return self._largest(lambda leaf: leaf.fastest(t, h))
 
     def over(self, t: Time, h: Time) -> Scalar:
         """The largest friction over a span: the logarithm of the factor by which a
@@ -146,6 +147,13 @@ class LinearFriction(eqx.Module):
     def is_singular(self, t: Time) -> Bool[Array, ""] | None:
         """Whether it is infinite at `t`; `None` if it never is."""
         return reduce_any(self._each(lambda leaf: leaf.is_singular(t)))
+
+    def of_motion_from(self, t: Time) -> "LinearFriction":
+        """The friction that makes motion from `t` decay: not at rates that are infinite
+        there like one over the time since, as such motion starts at rest and never has
+        the part that decays."""
+        leaves = self._map(lambda leaf: leaf.of_motion_from(t))
+        return LinearFriction(leaves, self.precision)
 
 
 _is_leaf = lambda x: isinstance(x, _LeafFriction)

@@ -48,9 +48,9 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     follow the motion, it is a shorter step: of schemes up to order two, of
     `TunedLinear8`, of systems with constraints or on manifolds, in spans of fewer than
     three steps, where neighbouring steps of `diffrax.StepTo` differ by more than a
-    factor of two, and where friction over a step is more than 0.5, of a matrix by a
-    bound, its rate has no second derivative by time, or its matrix turns momenta by
-    more than a radian. The
+    factor of two, and where friction over a step is more than 1.5, or a matrix turns
+    momenta by more than as many radians, or 0.5 if its rate depends on time, unless the
+    motion starts where it is infinite; and where that has no second derivative. The
     number of interpolated values is `sol.stats["interpolated"]`. How strong friction by
     place or by speed, of a `LagrangianSystem` or in a `force` is, is estimated at the
     start of the solve alone (a relaxation of 1 over a step): if it grows, use

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from .._friction._linear import LinearFriction
 from .._numbers import Scalar, State
 from .._scheme._base import between, Point, Scheme
 from .._scheme._engine import Result, Span
@@ -18,6 +19,8 @@ from .._system._bound import System
 # The largest friction over a step that polynomials are to follow. With more the motion
 # decays, or turns, too fast.
 MOST_FRICTION = 0.5
+# The same of those over several steps, at a constant rate: no singularity is near.
+MOST_CONSTANT = 1.5
 # More than any solve takes, in integers of either precision.
 MOST_STEPS = 2**30
 
@@ -30,14 +33,15 @@ class Stop(NamedTuple):
     time: Float[Array, ""] | None = None
 
 
-def follows(system: System, t0: Array, h: Array) -> Any:
-    """Whether polynomials can follow the motion over a step: the logarithm of a decay,
-    or half of the angle of a rotation, is small."""
-    friction, start, h = system.friction, jnp.minimum(t0, t0 + h), jnp.abs(h)
+def follows(
+    friction: LinearFriction | None, t0: Array, h: Array, most: float = MOST_FRICTION
+) -> Any:
+    """Whether polynomials can follow the motion over a step: the logarithm of a decay
+    and the angle of a rotation are small."""
     if friction is None:
         return True
-    most = jnp.maximum(friction.growth(start, h), friction.angle(h))
-    return (most <= MOST_FRICTION) & friction.is_smooth(start)
+    start, h = jnp.minimum(t0, t0 + h), jnp.abs(h)
+    return (friction.fastest(start, h) <= most) & friction.is_smooth(start)
 
 
 class AbstractSteps(eqx.Module):

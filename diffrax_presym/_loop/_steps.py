@@ -15,7 +15,14 @@ from .._scheme._engine import backward, is_autonomous, Span
 from .._scheme._failure import explain, unless_too_strong
 from .._scheme._prepare import prepare, prepare_once
 from .._system._bound import System
-from ._base import AbstractSteps, follows, MOST_STEPS, Stop
+from ._base import (
+    AbstractSteps,
+    follows,
+    MOST_CONSTANT,
+    MOST_FRICTION,
+    MOST_STEPS,
+    Stop,
+)
 
 
 _OTHER_ENDS = (
@@ -149,10 +156,17 @@ class Steps(AbstractSteps):
         """The first step from which on polynomials can follow the motion."""
         friction = system.friction
         assert friction is not None
+        most = MOST_CONSTANT if friction.is_autonomous else MOST_FRICTION
+        start = system.time(self.t0)
+        singular = friction.is_singular(start)
+        friction = friction.of_motion_from(start)
 
         def after(n: Array, first: Array) -> Array:
             t0, _, h = self.span(system, n)
-            return jnp.where(follows(system, t0, h), first, n + 1)
+            found = follows(friction, t0, h, most)
+            if singular is not None:
+                found &= ~singular | (n > 0)
+            return jnp.where(found, first, n + 1)
 
         zero = jnp.zeros((), int)
         if self.are_equal and friction.is_autonomous:

@@ -41,7 +41,7 @@ def end_of_step(
     begin, h = steps.begin(n, point), steps.end(n, point) - steps.begin(n, point)
     node = derivatives(scheme, system, begin, (y, carry))
     h = cast_to(system.direction, h) * h
-    smooth = follows(system, system.time(begin), h)
+    smooth = follows(system.friction, system.time(begin), h)
     return End(steps.time(point), node), jnp.asarray(smooth)
 
 
