@@ -12,7 +12,14 @@ from jaxtyping import Array, Bool, Inexact
 from .._forms import matvec, vecmat
 from .._numbers import as_time, cast_to, Scalar, Time
 from ._exponential import exponential_products, exponentials, norm, product
-from ._log_scale import AbstractLogScale, by_quadrature, Effect, increment, Terms
+from ._log_scale import (
+    AbstractLogScale,
+    by_quadrature,
+    Effect,
+    increment,
+    LinearScale,
+    Terms,
+)
 from ._near_singularity import by_powers
 from ._over_step import DecayOverStep
 
@@ -96,9 +103,6 @@ class EntryFriction(eqx.Module):
             return jnp.zeros_like(as_time(h))
         return jnp.max(increment(self.terms, t, h), initial=-jnp.inf)
 
-    def fastest(self, t: Time, h: Time) -> Scalar:
-        return self.growth(t, h)
-
     def over(self, t: Time, h: Time) -> Scalar:
         each = jnp.abs(increment(self.terms, t, h))
         if not self.is_autonomous:
@@ -141,6 +145,9 @@ class EntryFriction(eqx.Module):
             return jnp.where(here & (law.strength * rate > 0), 0, rate)
 
         return EntryFriction(tuple((law, seen(law, x)) for law, x in self.terms))
+
+    def by_rates(self) -> "EntryFriction":
+        return self
 
 
 class MatrixFriction(eqx.Module):
@@ -192,16 +199,6 @@ class MatrixFriction(eqx.Module):
         forwards, backwards = most(symmetric), most(-symmetric)
         return jnp.where(h > 0, forwards, backwards) * jnp.abs(h)
 
-    def fastest(self, t: Time, h: Time) -> Scalar:
-        matrix = cast_to(self.matrix, h := as_time(h))
-        size = jnp.maximum(norm(matrix), float(jnp.finfo(h.dtype).tiny))
-        power = matrix / size
-        for _ in range(3):
-            power = product(power, power)
-        # Of a power it is close to the largest eigenvalue, where that of the matrix may
-        # be several times as large.
-        return size * norm(power) ** (1 / 8) * jnp.abs(h)
-
     def over(self, t: Time, h: Time) -> Scalar:
         matrix = cast_to(self.matrix, h := as_time(h))
         symmetric = (matrix + jnp.swapaxes(matrix, -1, -2)) / 2
@@ -224,6 +221,15 @@ class MatrixFriction(eqx.Module):
 
     def of_motion_from(self, t: Time) -> "MatrixFriction":
         return self
+
+    def by_rates(self) -> EntryFriction:
+        size = jnp.maximum(norm(self.matrix), float(jnp.finfo(self.matrix.dtype).tiny))
+        power = self.matrix / size
+        for _ in range(3):
+            power = product(power, power)
+        # The norm of a power is close to that of its largest eigenvalue, where that of
+        # the matrix may be several times as large.
+        return EntryFriction(((LinearScale(), size * norm(power) ** (1 / 8)),))
 
 
 def _times(factor: Scalar, x: Array) -> Array:

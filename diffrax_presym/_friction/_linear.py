@@ -116,11 +116,6 @@ class LinearFriction(eqx.Module):
         `t`."""
         return self._largest(lambda leaf: leaf.growth(t, h))
 
-    def fastest(self, t: Time, h: Time) -> Scalar:
-        """The logarithm of the factor by which the fastest decay changes a momentum
-        over a span, or the angle of the fastest rotation; or a bound of them."""
-        return self._largest(lambda leaf: leaf.fastest(t, h))
-
     def over(self, t: Time, h: Time) -> Scalar:
         """The largest friction over a span: the logarithm of the factor by which a
         momentum decays or grows. Friction that falls with time is strong for some steps
@@ -153,6 +148,12 @@ class LinearFriction(eqx.Module):
         there like one over the time since, as such motion starts at rest and never has
         the part that decays."""
         leaves = self._map(lambda leaf: leaf.of_motion_from(t))
+        return LinearFriction(leaves, self.precision)
+
+    def by_rates(self) -> "LinearFriction":
+        """The same with a rate in place of each matrix, that of the fastest decay or
+        rotation, or a bound of it."""
+        leaves = self._map(lambda leaf: leaf.by_rates())
         return LinearFriction(leaves, self.precision)
 
 

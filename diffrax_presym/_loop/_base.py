@@ -36,12 +36,12 @@ class Stop(NamedTuple):
 def follows(
     friction: LinearFriction | None, t0: Array, h: Array, most: float = MOST_FRICTION
 ) -> Any:
-    """Whether polynomials can follow the motion over a step: the logarithm of a decay
-    and the angle of a rotation are small."""
+    """Whether polynomials can follow the motion over a step with friction `by_rates`:
+    the logarithm of a decay, and the angle of a rotation, are small."""
     if friction is None:
         return True
     start, h = jnp.minimum(t0, t0 + h), jnp.abs(h)
-    return (friction.fastest(start, h) <= most) & friction.is_smooth(start)
+    return (friction.growth(start, h) <= most) & friction.is_smooth(start)
 
 
 class AbstractSteps(eqx.Module):

@@ -103,7 +103,6 @@ class Problem(eqx.Module):
 
         self.rows = [Rows(sub, steps, max_steps) for sub in subs]
         some = any(rows.may_be_inside for rows in self.rows)
-        convert = _Traced
         # Where steps end is differentiated as part of the functions.
         self.steps, self.max_steps = steps.without_gradient(), max_steps
         self.stencils = [None] * len(self.rows)
@@ -111,7 +110,7 @@ class Problem(eqx.Module):
         resolved = scheme.is_resolved and solver.order(None) > 2
         if isinstance(steps, Steps) and some and resolved:
             each = number_of_derivatives(solver.order(None))
-            at_node = convert(
+            at_node = _Traced(
                 partial(node, scheme, system, steps, each), *(n, n, start)
             )
             first = first_node(system, steps, self.last, start[0])
@@ -122,27 +121,28 @@ class Problem(eqx.Module):
                     self.rows[i] = rows.known_after(stencils.known(rows))
         known = resolved and not system.has_unknown_friction
         if isinstance(steps, VariableSteps) and some and known:
-            end = lambda n, point: end_of_step(scheme, system, steps, n, point)
-            at_end = convert(end, n, start)
+            rates = None if system.friction is None else system.friction.by_rates()
+            end = partial(end_of_step, scheme, system, steps, rates)
+            at_end = _Traced(end, n, start)
             some = system.friction is not None
 
         outputs = [
-            convert(lambda t, y, fn=sub.fn: fn(t, y, system.args), t0, start[0])
+            _Traced(lambda t, y, fn=sub.fn: fn(t, y, system.args), t0, start[0])
             for sub in subs
         ]
-        within = convert(shorter, n, start, t0) if some else None
+        within = _Traced(shorter, n, start, t0) if some else None
         several = within, at_node, at_end, outputs
-        begins = None if begin is None else convert(begin, start[0])
-        self.functions = Functions(begins, convert(step, n, start), *several)
+        begins = None if begin is None else _Traced(begin, start[0])
+        self.functions = Functions(begins, _Traced(step, n, start), *several)
         self.start = start
         # Computed, so that it has the sharding of others within `jax.shard_map`.
         result = dfx.RESULTS.where(n < 0, NONFINITE, dfx.RESULTS.successful)
-        self.explain = convert(explained, n, start, result)
+        self.explain = _Traced(explained, n, start, result)
         self.undo = self.growth = None
         if reversal:
             back = steps.prepare(scheme, system, backward=True)
             undo = lambda n, point: steps.undo(scheme, system, n, point, back)
-            self.undo = convert(undo, n, start)
+            self.undo = _Traced(undo, n, start)
             self.growth = steps.growth(system, self.last)
         without_fn = lambda sub: eqx.tree_at(lambda x: x.fn, sub, None)
         self.subs = list(map(without_fn, subs))

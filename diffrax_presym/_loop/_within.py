@@ -16,6 +16,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .. import _tree as tree
+from .._friction._linear import LinearFriction
 from .._numbers import cast_to, State
 from .._scheme._base import Point, Scheme
 from .._system._bound import System
@@ -33,15 +34,21 @@ class End(NamedTuple):
 
 
 def end_of_step(
-    scheme: Scheme, system: System, steps: VariableSteps, n: Array, point: Point
+    scheme: Scheme,
+    system: System,
+    steps: VariableSteps,
+    friction: LinearFriction | None,
+    n: Array,
+    point: Point,
 ) -> tuple[End, Bool[Array, ""]]:
-    """The start of a step, and whether a polynomial can follow the motion within it."""
+    """The start of a step, and whether a polynomial can follow the motion within it,
+    with friction `by_rates`."""
     y, solver_state = point
     carry, _ = steps.split(solver_state)
     begin, h = steps.begin(n, point), steps.end(n, point) - steps.begin(n, point)
     node = derivatives(scheme, system, begin, (y, carry))
     h = cast_to(system.direction, h) * h
-    smooth = follows(system.friction, system.time(begin), h)
+    smooth = follows(friction, system.time(begin), h)
     return End(steps.time(point), node), jnp.asarray(smooth)
 
 
