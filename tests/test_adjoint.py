@@ -186,6 +186,9 @@ def test_second_derivatives_by_forward_over_reverse():
 
     exact = hessian_vector(dfx.DirectAdjoint())
     assert_close(hessian_vector(REVERSIBLE), exact, 1e-11)
+    # Also of states that are not kept.
+    none_kept = dps.FixedStepAdjoint("reversal", checkpoints=0)
+    assert_close(hessian_vector(none_kept), exact, 1e-11)
 
 
 def controlled(controller: Any, event: Any = None):
