@@ -222,8 +222,9 @@ class PresymplecticGauss(AbstractPresymplecticSolver):
         - `tolerance`: the relative change of the stages below which the fixed-point
             iteration may end, a Python float. Symmetry and structure are then kept to
             this tolerance only, and so are steps that `FixedStepAdjoint` takes
-            backwards. A hundredth of the error that is wanted saves up to two thirds
-            of the iterations. Defaults to 0, for iteration to rounding.
+            backwards. Over a few periods a hundredth of the error that is wanted
+            saves up to two thirds of the iterations; over hundreds the errors of the
+            steps add up. Defaults to 0, for iteration to rounding.
 
         **Raises:**
 
