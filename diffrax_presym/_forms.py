@@ -169,7 +169,7 @@ _SUMMED, _SUMMED_ALONE = 10, 32
 
 
 def vecmat(x: Array, matrix: Array) -> Array:
-    """A vector over the last axis, times a matrix for each that is one of many."""
+    """Vectors over the last axis, each times its matrix, one of those of a loop."""
     if matrix.shape[-1] <= _SUMMED or jnp.ndim(x) > 1:
         return jnp.sum(x[..., None] * matrix, axis=-2)
     return _alone(x, matrix) if len(x) <= _SUMMED_ALONE else x @ matrix
@@ -177,6 +177,7 @@ def vecmat(x: Array, matrix: Array) -> Array:
 
 @jax.custom_jvp
 def _alone(x: Array, matrix: Array) -> Array:
+    """One vector by a sum; those of a batch by a product."""
     product = jax.custom_batching.custom_vmap(lambda x, y: jnp.sum(x[:, None] * y, 0))
 
     @product.def_vmap
