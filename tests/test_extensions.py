@@ -71,3 +71,18 @@ def test_fields_of_friction_at_a_place_may_be_numbers(solver, adjoint, dtype):
     for x, y in zip(*map(jax.tree.leaves, pair), strict=True):
         assert x.dtype == y.dtype == dtype
         np.testing.assert_allclose(x, y, rtol=0, atol=20 * jnp.finfo(dtype).eps)
+
+
+def test_a_law_with_numbers_in_both_loops():
+    system = dps.MechanicalSystem(
+        dps.QuadraticKinetic(), lambda t, q, args: q[0], own.CubicDrag(0.3)
+    )
+    ends = [
+        dfx.diffeqsolve(
+            *(system, dps.Strang(), 0.0, 1.0, 0.1, (jnp.zeros(2), jnp.ones(2))),
+            adjoint=adjoint,
+        ).ys
+        for adjoint in (dps.FixedStepAdjoint(), dfx.RecursiveCheckpointAdjoint())
+    ]
+    for x, y in zip(*map(jax.tree.leaves, ends), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-14)
