@@ -137,17 +137,17 @@ class EntryFriction(eqx.Module):
     def is_singular(self, t: Time) -> Bool[Array, ""] | None:
         return reduce_any([law.is_singular(t) for law, _ in self.terms])
 
-    def of_motion_from(self, t: Time) -> "EntryFriction":
+    def by_rates(self, start: Time | None) -> "EntryFriction":
+        if start is None:
+            return self
+
         def seen(law: AbstractLogScale, rate: Array) -> Array:
-            here = law.is_singular(t) if law.strength else None
+            here = law.is_singular(start) if law.strength else None
             if here is None:
                 return rate
             return jnp.where(here & (law.strength * rate > 0), 0, rate)
 
         return EntryFriction(tuple((law, seen(law, x)) for law, x in self.terms))
-
-    def by_rates(self) -> "EntryFriction":
-        return self
 
 
 class MatrixFriction(eqx.Module):
@@ -219,10 +219,7 @@ class MatrixFriction(eqx.Module):
     def is_singular(self, t: Time) -> None:
         return None
 
-    def of_motion_from(self, t: Time) -> "MatrixFriction":
-        return self
-
-    def by_rates(self) -> EntryFriction:
+    def by_rates(self, start: Time | None) -> EntryFriction:
         size = jnp.maximum(norm(self.matrix), float(jnp.finfo(self.matrix.dtype).tiny))
         power = self.matrix / size
         for _ in range(3):

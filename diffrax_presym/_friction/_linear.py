@@ -143,17 +143,14 @@ class LinearFriction(eqx.Module):
         """Whether it is infinite at `t`; `None` if it never is."""
         return reduce_any(self._each(lambda leaf: leaf.is_singular(t)))
 
-    def of_motion_from(self, t: Time) -> "LinearFriction":
-        """The friction that makes motion from `t` decay: not at rates that are infinite
-        there like one over the time since, as such motion starts at rest and never has
-        the part that decays."""
-        leaves = self._map(lambda leaf: leaf.of_motion_from(t))
-        return LinearFriction(leaves, self.precision)
-
-    def by_rates(self) -> "LinearFriction":
+    def by_rates(self, start: Time | None = None) -> "LinearFriction":
         """The same with a rate in place of each matrix, that of the fastest decay or
-        rotation, or a bound of it."""
-        leaves = self._map(lambda leaf: leaf.by_rates())
+        rotation, or a bound of it.
+
+        Of motion from a `start`, without rates that are infinite there like one over
+        the time since: it starts at rest, and never has the part that decays.
+        """
+        leaves = self._map(lambda leaf: leaf.by_rates(start))
         return LinearFriction(leaves, self.precision)
 
 

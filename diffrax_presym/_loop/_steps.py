@@ -159,7 +159,7 @@ class Steps(AbstractSteps):
         most = MOST_CONSTANT if friction.is_autonomous else MOST_FRICTION
         start = system.time(self.t0)
         singular = friction.is_singular(start)
-        friction = friction.by_rates().of_motion_from(start)
+        friction = friction.by_rates(start)
 
         def after(n: Array, first: Array) -> Array:
             t0, _, h = self.span(system, n)
