@@ -315,3 +315,20 @@ def test_the_force_of_the_potential_is_evaluated_once_per_kick():
     ends(system, dps.BlanesMoan6(), 1.0, 10, Y0)
     jax.effects_barrier()
     assert len(count) == 100
+
+
+@pytest.mark.parametrize("size", [1e4, 1e7])
+@pytest.mark.parametrize("solver", SCHEMES, ids=lambda x: type(x).__name__)
+def test_forces_that_balance_each_other(solver, size):
+    """The equation of a kick is solved to the rounding of the largest of them."""
+    quadratic = lambda v: -v * jnp.sqrt(v**2 + 0.01)
+    found = []
+    for load in (0.0, size):
+        system = dps.MechanicalSystem(
+            *(UNIT, lambda t, q, args, x=load: spring(t, q, args) - x * jnp.sum(q)),
+            force=lambda t, q, v, args, x=load: quadratic(v) - x,
+        )
+        y, result = ends(system, solver, 2.0, 200, Y0)
+        assert result == successful
+        found.append(np.stack(y))
+    np.testing.assert_allclose(*found, atol=1e-15 * size * 200)

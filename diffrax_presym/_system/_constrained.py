@@ -23,7 +23,14 @@ from ._kinetic import QuadraticKinetic
 from ._manifold import ManifoldSystem
 from ._manifolds import size, unitless
 from ._mechanical import MechanicalSystem
-from ._multipliers import find_root, is_regular, LinearMap, Multipliers, solve
+from ._multipliers import (
+    as_matrix,
+    find_root,
+    is_regular,
+    LinearMap,
+    Multipliers,
+    solve,
+)
 from ._split import AbstractSplit
 
 
@@ -193,6 +200,15 @@ class ConstrainedSystem(AbstractSystem):
         """The map `G M^-1 G^T`."""
         normal = self.normal(t, q, args)
         return lambda x: self.rate(t, q, normal(x), args, flow=0.0)
+
+    def along(self, t: Time, q: Q, args: PyTree) -> Callable[[P], P]:
+        """The map from a force to its part along the constraints."""
+        gradient = jax.linearize(lambda q: self.value(t, q, args), q)[1]
+        rate = lambda force: gradient(self.velocity(t, q, force, args))
+        normal, solver = self.normal(t, q, args), self.linear_solver
+        like = jnp.zeros_like(self.value(t, q, args))
+        matrix = as_matrix(lambda x: rate(normal(x)), like, solver)
+        return lambda force: tree.sub(force, normal(solve(matrix, rate(force), solver)))
 
     def to_tangent(self, t: Time, q: Q, p: P, args: PyTree) -> P:
         """The change of a momentum that makes it tangential."""

@@ -35,6 +35,8 @@ class ConstrainedSplit(AbstractSplit):
     It is symmetric, of second order, and composed to the order that is needed. Momenta
     along the normals do not change where it ends, so they are projected at the end of a
     step alone, unless a kick depends on the momentum, or a drift is also inverted.
+    A kick that is not linear in the momentum is by forces along the constraint, or it
+    would be that of a velocity along the normals, which other forces gain in a step.
     """
 
     base: AbstractForceSplit
@@ -81,7 +83,12 @@ class ConstrainedSplit(AbstractSplit):
             return t + h, y, result
 
         success = jtu.tree_map(jnp.asarray, SUCCESSFUL)
-        return over_stages(stage, (t, y, success), data)[1:]
+        end, result = over_stages(stage, (t, y, success), data)[1:]
+        if self.base.kick_by == "momentum":
+            # Of a kick that was not solved there are no multipliers either.
+            kicked = tree.all_finite(y)
+            result = dfx.RESULTS.where(kicked, result, SUCCESSFUL)
+        return end, result
 
     def _stage(self, system, t, h, data, y) -> tuple[State, Array]:
         term, free, args, q = system.term, _free(system), system.args, y[0]
@@ -106,11 +113,24 @@ class ConstrainedSplit(AbstractSplit):
         return y, found
 
     def force(self, system, t, y) -> PyTree:
-        return self.base.force(_free(system), t, y)
+        force = self.base.force(_free(system), t, y)
+        if self.base.kick_by == "force":
+            return force
+        along = system.term.along(t, tree.values(y)[0], system.args)
+        if self.base.kick_by == "momentum":
+            return along(force)
+        force, forms, drags = force
+        return along(force) if drags else force, forms, drags
 
     def kick(self, system, t, h, y, force, order) -> State:
+        free, (q, p) = _free(system), tree.values(y)
         if self.base.kick_by == "force":
-            return self.base.kick(_free(system), t, h, y, force, _ORDER)
+            return self.base.kick(free, t, h, y, force, _ORDER)
+        if self.base.kick_by == "momentum":
+            along = system.term.along(t, q, system.args)
+            at = free, t, h, q, p, force, order
+            change = self.base.change(*at, once=True, along=along)
+            return system.add(y, (None, change(p)))
         stage = lambda y, h: self._kick_stage(system, t, h, y, force)
         return over_stages(stage, y, lengths(order, h))
 

@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, PyTree
 
 from .. import _tree as tree
-from .._implicit import contract, implicit, largest_change
+from .._implicit import contract, implicit, largest_change, lowest
 from .._numbers import as_time, Time
 
 
@@ -78,6 +78,7 @@ def _derivatives(force: _Force, p: PyTree, number: int) -> list[PyTree]:
 
 _NEGLIGIBLE = 1 / 8  # largest estimated change of another iteration to stop
 _ROUNDING = 16.0  # largest change at which stagnation is attributed to rounding
+_STALLED = 4  # iterations without a smaller change, after which a larger one may be
 _MOST = 128  # iterations
 _STIFF = 4.0  # slope times length, about twice that at which iterations diverge
 
@@ -85,6 +86,8 @@ _STIFF = 4.0  # slope times length, about twice that at which iterations diverge
 def _iterate(equation: _Equation, guess: PyTree) -> tuple[PyTree, Bool[Array, ""]]:
     """Fixed-point iteration to rounding: kicks are so short that it takes a few."""
     first = jnp.full_like(tree.largest(guess), _ROUNDING)
+    # Forces that balance each other leave the rounding of the largest of them.
+    rounding = float(jnp.finfo(lowest(guess)).eps) ** (-1 / 2)
 
     def ends(change):
         # A momentum that changes its sign may be far smaller at one of its ends than
@@ -93,16 +96,20 @@ def _iterate(equation: _Equation, guess: PyTree) -> tuple[PyTree, Bool[Array, ""
         return jtu.tree_map(lambda *x: jnp.stack(x), equation.p, new)
 
     def iterate(state):
-        found, moved, _, count = state
+        found, moved, _, least, stalled, count = state
         new = tree.add(found, equation.residual(found))
         change = largest_change(ends(new), ends(found), first.dtype)
-        return new, change, moved, count + 1
+        stalled = jnp.where(change < least, 0, stalled + 1)
+        return new, change, moved, jnp.minimum(change, least), stalled, count + 1
 
     def converged(state) -> Bool[Array, ""]:
-        _, moved, before, _ = state
+        _, moved, before, _, stalled, _ = state
         stagnates = (moved < _ROUNDING) & (moved >= before)
+        stagnates |= (stalled >= _STALLED) & (moved < rounding)
         return (moved * (moved / before) <= _NEGLIGIBLE) | stagnates
 
-    going = lambda x: ~converged(x) & jnp.isfinite(x[1]) & (x[3] < _MOST)
-    state = lax.while_loop(going, iterate, (guess, first, first, jnp.asarray(0)))
+    going = lambda x: ~converged(x) & jnp.isfinite(x[1]) & (x[-1] < _MOST)
+    none = jnp.asarray(0)
+    start = guess, first, first, jnp.full_like(first, jnp.inf), none, none
+    state = lax.while_loop(going, iterate, start)
     return state[0], converged(state)

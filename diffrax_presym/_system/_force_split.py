@@ -78,9 +78,11 @@ class AbstractForceSplit(AbstractSplit):
         force: PyTree,
         order: int,
         once: bool,
+        along: Callable[[PyTree], PyTree] = lambda force: force,
     ) -> Callable[[PyTree], PyTree]:
         """The change of momenta such as `p` by a kick at a place, as their function. If
-        that is not applied `once`, what takes longer to prepare pays."""
+        that is not applied `once`, what takes longer to prepare pays. An implicit kick
+        is by the part `along` constraints of all forces."""
         friction = system.friction if self.in_kicks(system, order) else None
         if self.kick_by != "momentum":
             force = force if self.kick_by == "friction" else (force, [], [])
@@ -91,7 +93,7 @@ class AbstractForceSplit(AbstractSplit):
 
         def total(p: PyTree) -> PyTree:
             net = force if friction is None else friction.net_force(t, force, p)
-            return term.add_forces(net, term.external, *state(p))
+            return along(term.add_forces(net, term.external, *state(p)))
 
         def change(p: PyTree) -> PyTree:
             dp, found = force_flow(total, h, p, order)

@@ -118,19 +118,20 @@ class _Tridiagonal(_AbstractMatrix):
         return _Tridiagonal(lower, self.diagonal, upper)
 
 
-def _as_matrix(
+def as_matrix(
     linear: LinearMap, like: Any, solver: lx.AbstractLinearSolver | None
-) -> _AbstractMatrix | None:
-    """The matrix, or `None` if a solver needs none. That of three diagonals is not
-    finite if other entries are not zero, as with masses or friction that join links."""
-    if isinstance(linear, _AbstractMatrix):
+) -> LinearMap:
+    """The matrix of a linear map, or the map itself if a solver needs none. That of
+    three diagonals is not finite if other entries are not zero, as with masses or
+    friction that join links."""
+    if isinstance(linear, _AbstractMatrix) or like.size == 0:
         return linear
     # Scans of length one fail within `eqx.error_if`, where XLA evaluates constants.
     if solver is None or like.size == 1:
         basis = jnp.eye(like.size, dtype=like.dtype)
         return _Dense(jax.vmap(linear, out_axes=1)(basis))
     if not isinstance(solver, lx.Tridiagonal):
-        return None
+        return linear
     # Each row couples three neighbours, so three products show all entries, and another
     # one whether these are all.
     row = jnp.arange(like.size)
@@ -152,8 +153,8 @@ def solve(
     there is none."""
     if b.size == 0:
         return b
-    matrix = lax.stop_gradient(_as_matrix(linear, b, solver))
-    if matrix is None:
+    matrix = lax.stop_gradient(as_matrix(linear, b, solver))
+    if not isinstance(matrix, _AbstractMatrix):
         assert solver is not None
         return solve_linear(linear, b, solver)
     attempt = lambda _, b: matrix.solve(b)
@@ -191,7 +192,7 @@ def find_root(
         def improve(state):
             x, _, count, change, miss = state
             new, linear = jax.linearize(residual, x)
-            linear = _as_matrix(linear, x, solver) or linear
+            linear = as_matrix(linear, x, solver)
             bend, before = tree.largest(linear(change) - miss), tree.largest(miss)
             limit, left = float(jnp.finfo(x.dtype).eps) ** (1 / 3), tree.largest(new)
             found = (left <= limit * before) | (left >= before / 8)
