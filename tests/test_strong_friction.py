@@ -209,3 +209,57 @@ def test_the_fastest_decay_or_rotation_of_a_matrix(n):
         friction = MatrixFriction(jnp.asarray(matrix)).by_rates(None)
         found = friction.growth(jnp.asarray(0.0), jnp.asarray(0.3))
         assert 0.3 * largest <= found <= 0.3 * 1.5 * largest
+
+
+def chain_and_modes(n, strength):
+    """Masses with dampers between them that are strong, and their modes."""
+    stretch = np.eye(n) - np.eye(n, k=-1)
+    stiffness = stretch.T @ stretch
+    squares, modes = np.linalg.eigh(stiffness)
+    q0 = 1 + np.arange(n) / n
+    pairs = (stiffness, q0), (squares, modes.T @ q0)
+    out = []
+    for matrix, start in pairs:
+        law = dps.ViscousDamping(jnp.asarray(strength * matrix))
+        spring = dps.QuadraticPotential(jnp.asarray(matrix))
+        out.append((damped(law, spring), (jnp.asarray(start), jnp.zeros(n))))
+    return out, modes
+
+
+@pytest.mark.parametrize("solver", [dps.Strang(), dps.PresymplecticLeapfrog()])
+@pytest.mark.parametrize("n", [3, 30])
+@pytest.mark.parametrize("strength", [1e2, 1e5, 1e8])
+def test_matrices_of_any_strength_are_their_modes(strength, n, solver):
+    """Also within steps, and with gradients, without as many products as there is
+    friction over a step."""
+    ((system, y0), (alone, z0)), modes = chain_and_modes(n, strength)
+    ts = jnp.array([0.1, 0.5, 0.7, 1.0])
+
+    @jax.jit
+    def run(system, y0):
+        args = system, solver, 0.0, 1.0, 0.5, y0
+        sol: Any = solve(*args, saveat=dfx.SaveAt(ts=ts), adjoint=FIXED)
+        return sol.ys
+
+    (q, p), (x, v) = run(system, y0), run(alone, z0)
+    # Entries of the matrix that are rounded are other modes.
+    rounding = 1e-12 + 1e-15 * strength
+    np.testing.assert_allclose(q, x @ modes.T, atol=rounding)
+    np.testing.assert_allclose(p, v @ modes.T, atol=rounding)
+    slope = jax.grad(lambda y, system: jnp.sum(run(system, y)[0] ** 2))
+    np.testing.assert_allclose(
+        slope(y0, system)[0], modes @ slope(z0, alone)[0], atol=10 * rounding
+    )
+
+
+@pytest.mark.parametrize("h_gamma", [20.0, 40.0])
+def test_a_matrix_is_as_strong_as_its_modes(h_gamma):
+    ((system, y0), (alone, z0)), _ = chain_and_modes(8, 1.0)
+    fastest = float(np.max(alone.laws[0].coefficients))
+    h = h_gamma / fastest
+    results = [
+        solve(x, dps.TunedRKN6(), 0.0, 40 * h, h, y, adjoint=FIXED, throw=False).result
+        for x, y in ((system, y0), (alone, z0))
+    ]
+    good = [x == dfx.RESULTS.successful for x in results]
+    assert good == ([True, True] if h_gamma < 29 else [False, False])

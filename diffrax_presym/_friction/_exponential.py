@@ -67,11 +67,12 @@ def _horner(terms: list[float], x: Numbers) -> Numbers:
 # Terms of a series where the matrix times the time has a norm of at most 1/2: the first
 # omitted one is below the rounding of `float64`.
 _TERMS = 14
-_SQUARINGS = 16
 # On a CPU XLA makes one function of a loop, unless it multiplies matrices larger than
 # 3 x 3. Sums of products are 4 to 50 times faster for matrices of 4 to 12, and
 # 3 times slower for those of 16.
 _MOST_SUMMED = 12
+# Parts of the time for each row of a matrix, from which on it is squared instead.
+_MOST_PARTS = 2
 
 
 def exponentials(
@@ -82,14 +83,16 @@ def exponentials(
 
     By scaling and squaring, with powers of the matrix that all times share. The change
     is computed without cancellation. Both are NaN if the matrix times the longest time
-    has a norm beyond about 3e4, and for a time that is not finite.
+    has a norm of which the rounding leaves less than two digits, about 1e13 and, in
+    `float32`, 3e4, and for a time that is not finite.
     """
     times = cast_to(times, matrix)
     known = jnp.isfinite(times)
     times = jnp.where(known, times, 0)
     longest = jnp.max(jnp.abs(times))
     halvings = jnp.ceil(jnp.log2(jnp.maximum(2 * norm(matrix) * longest, 1)))
-    solvable = halvings <= _SQUARINGS
+    squarings = jnp.finfo(times.dtype).nmant - 7
+    solvable = halvings <= squarings
     halvings = jnp.where(solvable, halvings, 0)
     unit = jnp.where(longest == 0, 1, longest) * 2**-halvings
     fractions = times / jnp.where(longest == 0, 1, longest)
@@ -121,7 +124,7 @@ def exponentials(
 
         return lax.cond(i < halvings, doubled, lambda x: x, x), None
 
-    numbers = np.arange(_SQUARINGS, dtype=z.dtype)
+    numbers = np.arange(squarings, dtype=z.dtype)
     (change, mean), _ = lax.scan(double, (change, mean), numbers)
     expand = lambda x: jnp.expand_dims(x, range(1, mean.ndim))
     valid = lambda x: jnp.where(solvable & expand(known), x, jnp.nan)
@@ -151,8 +154,21 @@ def exponential_products(
     time: Inexact[Array, ""],
     x: Inexact[Array, "*batch n"],
 ) -> tuple[Inexact[Array, "*batch n"], Inexact[Array, "*batch n"]]:
-    """As `exponentials` times a vector, without the matrices: by the series, over as
-    many parts of the time as it needs."""
+    """As `exponentials` times a vector: without the matrices, by the series, over as
+    many parts of the time as it needs, unless these are many."""
+    parts = _parts(matrix, time)
+    # One decision for a batch: otherwise both would be computed. Of what is not finite
+    # there is none.
+    strong = eqxi.unvmap_any(~(parts <= _MOST_PARTS * matrix.shape[-1]))
+    return lax.cond(strong, _by_matrices, _by_products, matrix, time, x)
+
+
+def _by_matrices(matrix: Array, time: Array, x: Array) -> tuple[Array, Array]:
+    change, integral = exponentials(matrix, time[None])
+    return matvec(change[0], x), matvec(integral[0], x)
+
+
+def _by_products(matrix: Array, time: Array, x: Array) -> tuple[Array, Array]:
     parts = _parts(matrix, time)
     part = time / parts
     size, rounding = norm(matrix) * jnp.abs(part), float(jnp.finfo(x.dtype).eps)
@@ -166,10 +182,7 @@ def exponential_products(
         return i + 1, change + more[0], integral + more[1]
 
     start = jnp.zeros_like(parts), jnp.zeros_like(x), jnp.zeros_like(x)
-    most = jnp.minimum(parts, 2.0**_SQUARINGS)
-    _, change, integral = lax.while_loop(lambda x: x[0] < most, advance, start)
-    valid = lambda x: jnp.where(parts <= 2.0**_SQUARINGS, x, jnp.nan)
-    return valid(change), valid(integral)
+    return lax.while_loop(lambda x: x[0] < parts, advance, start)[1:]
 
 
 def _parts(matrix: Array, time: Array) -> Array:
@@ -196,13 +209,7 @@ def _short(
 def _exponential_products_jvp(primals, tangents):
     # A loop of unknown length has no reverse mode: the series if it is enough, and
     # the matrices otherwise.
-    @jax.checkpoint
-    def dense(matrix, time, x):
-        both = exponentials(matrix, time[None])
-        return tuple(matvec(y[0], x) for y in both)
-
-    # One decision for a batch: otherwise both would be computed.
     weak = ~eqxi.unvmap_any(_parts(*primals[:2]) > 1)
     derivative = lambda fn: lambda x, dx: jax.jvp(fn, x, dx)[1]
-    both = derivative(_short), derivative(dense)
+    both = derivative(_short), derivative(jax.checkpoint(_by_matrices))
     return exponential_products(*primals), lax.cond(weak, *both, primals, tangents)

@@ -202,10 +202,11 @@ class MatrixFriction(eqx.Module):
     def over(self, t: Time, h: Time) -> Scalar:
         matrix = cast_to(self.matrix, h := as_time(h))
         symmetric = (matrix + jnp.swapaxes(matrix, -1, -2)) / 2
-        # At least this, the length of a column: a bound from above might fail a solve
-        # that is right.
-        column = jnp.sqrt(jnp.sum(symmetric**2, axis=-2))
-        return jnp.max(column, initial=0) * jnp.abs(h)
+        # At least this, by the length of a column of a power: a bound from above might
+        # fail a solve that is right.
+        size, power = _power(symmetric)
+        column = jnp.sqrt(jnp.sum(power**2, axis=-2))
+        return size * jnp.max(column, initial=0) ** (1 / _EXPONENT) * jnp.abs(h)
 
     def strength(self, t: Time, h: Time) -> Scalar:
         return self.growth(t, h)
@@ -220,13 +221,23 @@ class MatrixFriction(eqx.Module):
         return None
 
     def by_rates(self, start: Time | None) -> EntryFriction:
-        size = jnp.maximum(norm(self.matrix), float(jnp.finfo(self.matrix.dtype).tiny))
-        power = self.matrix / size
-        for _ in range(3):
-            power = product(power, power)
         # The norm of a power is close to that of its largest eigenvalue, where that of
         # the matrix may be several times as large.
-        return EntryFriction(((LinearScale(), size * norm(power) ** (1 / 8)),))
+        size, power = _power(self.matrix)
+        rate = size * norm(power) ** (1 / _EXPONENT)
+        return EntryFriction(((LinearScale(), rate),))
+
+
+_EXPONENT = 8
+
+
+def _power(matrix: Array) -> tuple[Scalar, Array]:
+    """A size of a matrix, and the power of the matrix over it."""
+    size = jnp.maximum(norm(matrix), float(jnp.finfo(matrix.dtype).tiny))
+    power = matrix / size
+    for _ in range(3):
+        power = product(power, power)
+    return size, power
 
 
 def _times(factor: Scalar, x: Array) -> Array:

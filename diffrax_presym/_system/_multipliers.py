@@ -153,10 +153,11 @@ def solve(
     there is none."""
     if b.size == 0:
         return b
-    matrix = lax.stop_gradient(as_matrix(linear, b, solver))
+    matrix = as_matrix(linear, b, solver)
     if not isinstance(matrix, _AbstractMatrix):
         assert solver is not None
         return solve_linear(linear, b, solver)
+    matrix = lax.stop_gradient(matrix)
     attempt = lambda _, b: matrix.solve(b)
     transposed = lambda _, b: matrix.transpose.solve(b)
     return lax.custom_linear_solve(linear, b, attempt, transposed)
