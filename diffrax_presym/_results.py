@@ -34,7 +34,8 @@ FRICTION_TOO_STRONG = _entry(
     "friction_too_strong",
     "The friction over one step, the rate times the length of the step, is more than "
     "this scheme can resolve. Take shorter steps (`choose_step` finds them), or use "
-    "`Strang()`, which is stable, or `PresymplecticGauss(stages, root_finder)`.",
+    "`Strang()`, which is stable and right in positions, not in the velocities of "
+    "what is damped so strongly, or `PresymplecticGauss(stages, root_finder)`.",
 )
 NOT_CONVERGED = _entry(
     "fixed_point_not_converged",

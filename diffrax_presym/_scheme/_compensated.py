@@ -18,8 +18,8 @@ class Compensated(AbstractPresymplecticSolver):
     error is smaller by about a factor of the step size.
 
     For very many steps without damping, especially in `float32`. Not for strong
-    friction, which damps rounding errors anyway, nor for implicit schemes whose root
-    finder is less accurate than rounding.
+    friction, which damps rounding errors anyway, nor for `PresymplecticGauss`, which
+    sums so by itself and stays as it is.
 
     ??? cite "Reference"
 

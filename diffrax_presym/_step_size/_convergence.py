@@ -182,7 +182,8 @@ def _check_rounding(law: Law, coarse: Solution):
             f"`choose_step` cannot reach this tolerance in {precision}: from "
             f"{least.steps} steps on, solves with more steps differ by rounding, by "
             f"{least.error:.1e} times the tolerance or more. Use "
-            f"{equal if law.claimed is None else ''}`Compensated(solver)`, "
+            f"{equal if law.claimed is None else ''}`Compensated(solver)`, unless "
+            "that is `PresymplecticGauss`, which is compensated already, "
             f"{double if precision == np.float32 else ''}or a larger tolerance."
         )
 
