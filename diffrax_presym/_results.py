@@ -51,7 +51,9 @@ FORCE_NOT_SOLVED = _entry(
     "The equation of a kick by a `force` of the velocity was not solved, or the state "
     "left the finite numbers, as by a parameter that is NaN. Otherwise the force is "
     "too stiff for the step, whose length times its slope by momentum must be below "
-    "about 2. Take shorter steps; write what is linear in the velocity as "
+    "about 2; or there are constraints that are redundant, which "
+    "`system.project(t0, y0, args)` detects. Take shorter steps; write what is linear "
+    "in the velocity as "
     "`friction=ViscousDamping(C)`, also with a function `C(t, q, args)`; or use "
     "`PresymplecticGauss(stages, optimistix.Newton(rtol, atol))`, but on manifolds.",
 )
