@@ -153,7 +153,7 @@ MUTANTS = [
         'if self.base.kick_by == "force" else y', "if False else y",
         tests="test_constrained.py"),
     Mutant("drag of velocities across constraints", "_system/_constrained_split.py",
-        "return along(force) if drags else force", "return force",
+        "along(force) if drags else force", "force",
         tests="test_constrained_forces.py"),
     Mutant("an elimination of diagonals has no pivots", "_system/_multipliers.py",
         "jnp.abs(after[0]) > jnp.abs(row[0])", "jnp.abs(row[0]) < 0",

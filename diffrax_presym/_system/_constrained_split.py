@@ -113,23 +113,19 @@ class ConstrainedSplit(AbstractSplit):
         return y, found
 
     def force(self, system, t, y) -> PyTree:
-        force = self.base.force(_free(system), t, y)
-        if self.base.kick_by == "force":
-            return force
-        along = system.term.along(t, tree.values(y)[0], system.args)
-        if self.base.kick_by == "momentum":
-            return along(force)
-        force, forms, drags = force
-        return along(force) if drags else force, forms, drags
+        return self.base.force(_free(system), t, y)
 
     def kick(self, system, t, h, y, force, order) -> State:
         free, q = _free(system), tree.values(y)[0]
         if self.base.kick_by == "force":
             return self.base.kick(free, t, h, y, force, _ORDER)
+        along = system.term.along(t, q, system.args)
         if self.base.kick_by == "friction":
+            force, forms, drags = force
+            force = along(force) if drags else force, forms, drags
             stage = lambda y, h: self._kick_stage(system, t, h, y, force)
             return over_stages(stage, y, lengths(order, h))
-        along = system.term.along(t, q, system.args)
+        force = along(force)
 
         def implicit(y: State, h: Time) -> State:
             at = free, t, h, *tree.values(y), force, _ORDER
