@@ -157,10 +157,13 @@ def exponential_products(
     """As `exponentials` times a vector: without the matrices, by the series, over as
     many parts of the time as it needs, unless these are many."""
     parts = _parts(matrix, time)
-    # One decision for a batch: otherwise both would be computed. Of what is not finite
-    # there is none.
+    # One decision for a batch: otherwise both would be computed. What is not finite is
+    # left to the matrices, which are NaN then.
     strong = eqxi.unvmap_any(~(parts <= _MOST_PARTS * matrix.shape[-1]))
-    return lax.cond(strong, _by_matrices, _by_products, matrix, time, x)
+    found = _by_products(matrix, jnp.where(strong, 0, time), x)
+    # A loop, as XLA copies what a conditional takes.
+    by_matrices = lambda _: (jnp.asarray(False), *_by_matrices(matrix, time, x))
+    return lax.while_loop(lambda state: state[0], by_matrices, (strong, *found))[1:]
 
 
 def _by_matrices(matrix: Array, time: Array, x: Array) -> tuple[Array, Array]:

@@ -103,7 +103,7 @@ class EntryFriction(eqx.Module):
             return jnp.zeros_like(as_time(h))
         return jnp.max(increment(self.terms, t, h), initial=-jnp.inf)
 
-    def over(self, t: Time, h: Time) -> Scalar:
+    def over(self, t: Time, h: Time, closely: bool) -> Scalar:
         each = jnp.abs(increment(self.terms, t, h))
         if not self.is_autonomous:
             rate = lambda t: functools.reduce(
@@ -199,14 +199,21 @@ class MatrixFriction(eqx.Module):
         forwards, backwards = most(symmetric), most(-symmetric)
         return jnp.where(h > 0, forwards, backwards) * jnp.abs(h)
 
-    def over(self, t: Time, h: Time) -> Scalar:
+    def over(self, t: Time, h: Time, closely: bool) -> Scalar:
         matrix = cast_to(self.matrix, h := as_time(h))
         symmetric = (matrix + jnp.swapaxes(matrix, -1, -2)) / 2
-        # At least this, by the length of a column of a power: a bound from above might
-        # fail a solve that is right.
-        size, power = _power(symmetric)
-        column = jnp.sqrt(jnp.sum(power**2, axis=-2))
-        return size * jnp.max(column, initial=0) ** (1 / _EXPONENT) * jnp.abs(h)
+        # At least this, the length of a column: a bound from above might fail a solve
+        # that is right.
+        squares = jnp.sum(symmetric**2, axis=-2)
+        most = jnp.max(squares, axis=-1, keepdims=True)
+        if closely:
+            # By how much the matrix lengthens this column.
+            longest = (squares == most)[..., None, :]
+            column = jnp.sum(jnp.where(longest, symmetric, 0), axis=-1)
+            before = jnp.sum(column**2, axis=-1, keepdims=True)
+            after = jnp.sum(vecmat(column, symmetric) ** 2, axis=-1, keepdims=True)
+            most = after / jnp.where(before == 0, 1, before)
+        return jnp.sqrt(jnp.max(most, initial=0)) * jnp.abs(h)
 
     def strength(self, t: Time, h: Time) -> Scalar:
         return self.growth(t, h)
@@ -221,23 +228,13 @@ class MatrixFriction(eqx.Module):
         return None
 
     def by_rates(self, start: Time | None) -> EntryFriction:
+        size = jnp.maximum(norm(self.matrix), float(jnp.finfo(self.matrix.dtype).tiny))
+        power = self.matrix / size
+        for _ in range(3):
+            power = product(power, power)
         # The norm of a power is close to that of its largest eigenvalue, where that of
         # the matrix may be several times as large.
-        size, power = _power(self.matrix)
-        rate = size * norm(power) ** (1 / _EXPONENT)
-        return EntryFriction(((LinearScale(), rate),))
-
-
-_EXPONENT = 8
-
-
-def _power(matrix: Array) -> tuple[Scalar, Array]:
-    """A size of a matrix, and the power of the matrix over it."""
-    size = jnp.maximum(norm(matrix), float(jnp.finfo(matrix.dtype).tiny))
-    power = matrix / size
-    for _ in range(3):
-        power = product(power, power)
-    return size, power
+        return EntryFriction(((LinearScale(), size * norm(power) ** (1 / 8)),))
 
 
 def _times(factor: Scalar, x: Array) -> Array:

@@ -116,11 +116,12 @@ class LinearFriction(eqx.Module):
         `t`."""
         return self._largest(lambda leaf: leaf.growth(t, h))
 
-    def over(self, t: Time, h: Time) -> Scalar:
+    def over(self, t: Time, h: Time, closely: bool = False) -> Scalar:
         """The largest friction over a span: the logarithm of the factor by which a
-        momentum decays or grows. Friction that falls with time is strong for some steps
+        momentum decays or grows, for matrices a bound from below, which takes another
+        product to be close. Friction that falls with time is strong for some steps
         only, and is not counted."""
-        return self._largest(lambda leaf: leaf.over(t, h))
+        return self._largest(lambda leaf: leaf.over(t, h, closely))
 
     def strength(self, t: Time, h: Time) -> Scalar:
         """The logarithm of the factor by which friction that lasts makes momenta decay

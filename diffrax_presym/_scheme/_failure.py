@@ -22,7 +22,7 @@ def _is_too_strong(most: float, system: System, span: Span) -> Bool[Array, ""] |
     if system.friction is None or most == math.inf:
         return None
     friction = tree.stop_gradient(system.friction)
-    return friction.over(span.t0, span.h) > most
+    return friction.over(span.t0, span.h, closely=True) > most
 
 
 def unless_too_strong(most: float, system: System, span: Span, data: PyTree) -> PyTree:

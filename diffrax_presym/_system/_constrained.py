@@ -207,7 +207,7 @@ class ConstrainedSystem(AbstractSystem):
         rate = lambda force: gradient(self.velocity(t, q, force, args))
         normal, solver = self.normal(t, q, args), self.linear_solver
         like = jnp.zeros_like(self.value(t, q, args))
-        matrix = as_matrix(lambda x: rate(normal(x)), like, solver)
+        matrix = as_matrix(self._matrix(t, q, args), like, solver)
         return lambda force: tree.sub(force, normal(solve(matrix, rate(force), solver)))
 
     def to_tangent(self, t: Time, q: Q, p: P, args: PyTree) -> P:
