@@ -210,9 +210,10 @@ class ConstrainedSystem(AbstractSystem):
         matrix = as_matrix(self._matrix(t, q, args), like, solver)
         return lambda force: tree.sub(force, normal(solve(matrix, rate(force), solver)))
 
-    def to_tangent(self, t: Time, q: Q, p: P, args: PyTree) -> P:
-        """The change of a momentum that makes it tangential."""
-        return self._reaction(t, q, self.rate(t, q, p, args), args)
+    def to_tangent(self, t: Time, q: Q, p: P, args: PyTree, flow: float = 1.0) -> P:
+        """The change of a momentum that makes it tangential; as of a force, if time
+        does not `flow`."""
+        return self._reaction(t, q, self.rate(t, q, p, args, flow), args)
 
     def _reaction(self, t: Time, q: Q, miss: Multipliers, args: PyTree) -> P:
         linear = self._matrix(t, q, args)

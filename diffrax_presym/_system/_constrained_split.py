@@ -113,19 +113,23 @@ class ConstrainedSplit(AbstractSplit):
         return y, found
 
     def force(self, system, t, y) -> PyTree:
-        return self.base.force(_free(system), t, y)
+        force, q = self.base.force(_free(system), t, y), tree.values(y)[0]
+        # What it would gain along the normals may lead to other points of the
+        # constraint.
+        change = lambda x: system.term.to_tangent(t, q, x, system.args, flow=0.0)
+        if self.base.kick_by != "friction":
+            return tree.add(force, change(force))
+        force, *friction = force
+        return tree.add(force, change(force)), *friction
 
     def kick(self, system, t, h, y, force, order) -> State:
         free, q = _free(system), tree.values(y)[0]
         if self.base.kick_by == "force":
             return self.base.kick(free, t, h, y, force, _ORDER)
-        along = system.term.along(t, q, system.args)
         if self.base.kick_by == "friction":
-            force, forms, drags = force
-            force = along(force) if drags else force, forms, drags
             stage = lambda y, h: self._kick_stage(system, t, h, y, force)
             return over_stages(stage, y, lengths(order, h))
-        force = along(force)
+        along = system.term.along(t, q, system.args)
 
         def implicit(y: State, h: Time) -> State:
             at = free, t, h, *tree.values(y), force, _ORDER
