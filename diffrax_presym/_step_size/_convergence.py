@@ -38,6 +38,7 @@ def find_steps(
     report: Callable[[Trial], None],
 ) -> Choice:
     law = grid = doubted = None
+    found: list[Trial] = []
     failed: list[Trial] = []  # No longer step is chosen than those of these.
     interpolates: dict[int, bool] = {}  # whether a solve does, by its number of steps
     same, numbers, expected = 0, doubling(4), float
@@ -66,13 +67,18 @@ def find_steps(
                     "steps of constant size."
                 )
             continue  # Steps between given times may be the same.
-        same, law = 0, law.add(finest)
-        high = law.trial(last)
+        same, before, law = 0, law, law.add(finest)
+        high, best_law = law.trial(last), law
         report(high)
-        converges = len(law.ladder) > 1 and (law.converges or law.agrees)
+        found.append(high)
+        if law.rounds:
+            # The last solve has the largest errors of rounding.
+            high, best_law = found[-2], before._replace(extrapolates=False)
+        agrees = law.agrees or law.rounds
+        converges = len(law.ladder) > 1 and (law.converges or agrees)
         if grid and high.error <= 1 and (converges or doubted):
 
-            def measure(n: int, law: Law = law) -> Trial:
+            def measure(n: int, law: Law = best_law) -> Trial:
                 solution = law.finest if n == law.finest.number else solve(n)
                 interpolates[n] = solution.interpolates
                 report(trial := law.trial(solution))
@@ -80,9 +86,9 @@ def find_steps(
                     failed.append(trial)
                 return trial
 
-            smooth = _is_smooth(law, high, grid, measure)
+            smooth = _is_smooth(best_law, high, grid, measure)
             rounding = max(x.error for x in law.ladder[-2:]) < 1e-3
-            rounding = rounding or (law.agrees and not law.exceeds(0.75))
+            rounding = rounding or (agrees and not law.exceeds(0.75))
             if rounding:
                 finest.check_precision(*tolerances)
             order = math.nan if rounding else law.orders[-1]
@@ -90,7 +96,7 @@ def find_steps(
             if smooth or doubted:
                 best = high
                 if smooth:
-                    best = _smallest(law, failed, high, grid, measure)
+                    best = _smallest(best_law, failed, high, grid, measure)
                 own = grid.of_solve(interpolates[best.number])
                 more = int(own.cheaper(np.array([best.number]))[0])
                 if best.number < more and expected(more) <= max_steps:
@@ -112,8 +118,11 @@ def _is_smooth(law: Law, high: Trial, grid: Grid, measure) -> bool:
     """Whether errors fall by the law also where steps have another phase: where a force
     jumps inside of a step, they may have fallen by chance."""
     order = law.orders[-1]
-    if 0.75 <= order < law.least or not (law.agrees or order >= law.least):
+    if law.extrapolates and (
+        0.75 <= order < law.least or not (law.agrees or order >= law.least)
+    ):
         return False
+    most = (0.5 if law.agrees else 0.1) if law.extrapolates else 1
     unit = grid.intervals or 1
     unit = unit if high.number % unit == 0 else 1
     settled = law.exceeds(0.65 * (law.claimed or 2))
@@ -122,7 +131,7 @@ def _is_smooth(law: Law, high: Trial, grid: Grid, measure) -> bool:
     numbers = (2 * unit * math.ceil(x * high.number / unit / 2) for x in factors)
     for trial in map(measure, dict.fromkeys(numbers)):
         expected = 1.3 * high.error * (high.steps / trial.steps) ** law.least
-        if not trial.error <= max(expected, 0.5 if law.agrees else 0.1):
+        if not trial.error <= max(expected, most):
             return False
     return True
 
@@ -144,7 +153,7 @@ def _smallest(law: Law, failed: list[Trial], high: Trial, grid: Grid, measure) -
         between = np.linspace(low.number + 1, high.number - 1, _CANDIDATES).astype(int)
         numbers = np.unique(grid.cheaper(between))
         numbers = numbers[(numbers > low.number) & (numbers < high.number)]
-        if high.error >= ENOUGH or not numbers.size:
+        if (law.extrapolates and high.error >= ENOUGH) or not numbers.size:
             break
         # By the law of convergence, between the two on a log scale. Where the larger
         # step is unstable, errors fall faster than that.
@@ -153,8 +162,10 @@ def _smallest(law: Law, failed: list[Trial], high: Trial, grid: Grid, measure) -
             slope = math.log(low.error / error) / math.log(high.number / low.number)
             slope = min(slope, steepest)
         guess = high.number * (error / AIM) ** (1 / slope)
+        middle = math.sqrt(low.number * high.number)
         if again:  # Not close to the lower end.
-            guess = max(guess, math.sqrt(low.number * high.number))
+            guess = max(guess, middle)
+        guess = guess if law.extrapolates else middle
         trial = measure(int(numbers[np.argmin(np.abs(numbers - guess))]))
         again = trial.error > 1
         low, high = (trial, high) if again else (low, trial)
@@ -166,11 +177,8 @@ def _check_rounding(law: Law, coarse: Solution):
     fine = law.finest
     if not (coarse.finite and fine.finite and all(x < 0.5 for x in law.orders[-2:])):
         return
-    pairs = zip(coarse.leaves, fine.leaves, strict=True)
-    pairs = [x for x in pairs if np.issubdtype(x[1].dtype, np.floating)]
-    precision = max((b.dtype for _, b in pairs), key=lambda x: np.finfo(x).eps)
-    size, eps = lambda x: np.max(np.abs(x), initial=0), float(np.finfo(precision).eps)
-    change = max(float(size(a - b) / max(size(b), 1e-300)) for a, b in pairs)
+    precision, change = coarse.relative_change(fine)
+    eps = float(np.finfo(precision).eps)
     settled = 0.65 * (law.claimed or 2)
     settled = any(law.exceeds(settled, i) for i in range(3, len(law.orders)))
     if change < 1e3 * eps or (settled and change < eps**0.5):

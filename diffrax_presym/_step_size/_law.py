@@ -45,12 +45,18 @@ class Law(NamedTuple):
     finest: Solution
     claimed: int | None
     tolerances: tuple[float, float]
+    by_rounding: bool = False  # whether the last difference may be
+    extrapolates: bool = True  # not if most of the differences are by rounding
 
     def add(self, finer: Solution) -> "Law":
         law = self._replace(finest=finer, claimed=finer.order or self.claimed)
         last = self.finest
         step = Trial(last.steps, law.difference(last), last.number)
-        return law._replace(ladder=(*self.ladder, step))
+        may_be = False
+        if last.finite and finer.finite:
+            precision, change = last.relative_change(finer)
+            may_be = change <= float(np.finfo(precision).eps) * finer.steps
+        return law._replace(ladder=(*self.ladder, step), by_rounding=may_be)
 
     @property
     def orders(self) -> list[float]:
@@ -79,6 +85,14 @@ class Law(NamedTuple):
         seen = len(three) == 3 and three[-1].steps >= SEEING
         return seen and max(x.error for x in three) <= 0.5
 
+    @property
+    def rounds(self) -> bool:
+        """Whether three solves agree to the tolerance, and more steps only add to their
+        errors of rounding."""
+        two = self.ladder[-2:]
+        seen = len(two) == 2 and two[0].steps >= SEEING and self.orders[-1] < 0
+        return seen and self.by_rounding and max(x.error for x in two) <= 1
+
     def difference(self, solution: Solution) -> float:
         if not (solution.finite and self.finest.finite):
             return math.inf
@@ -87,6 +101,9 @@ class Law(NamedTuple):
     def trial(self, solution: Solution) -> Trial:
         error, steps, order = self.difference(solution), solution.steps, self.orders[-1]
         order = order if order >= 0.75 else (self.claimed or 2)
+        if not self.extrapolates:
+            # The finest has an error of its own, at most that which is known.
+            return Trial(steps, error + self.ladder[-1].error, solution.number)
         if steps < self.finest.steps:
             error /= 1 - (steps / self.finest.steps) ** order
         elif error <= 1:
