@@ -3,6 +3,7 @@
 from typing import Any
 
 import diffrax as dfx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -165,3 +166,23 @@ def test_the_energy_balance_over_long_times(times):
     error = diagnostics.energy_error(system, ts, sol.ys)
     assert error.shape == ts.shape
     assert np.max(np.abs(error)) < 1e-8
+
+
+@pytest.mark.parametrize(
+    "balance",
+    [
+        diagnostics.energy,
+        diagnostics.energy_error,
+        energy_lost,
+        diagnostics.power_lost,
+    ],
+)
+def test_a_batch_is_refused_but_by_vmap(balance):
+    both = lambda x: jnp.stack([x, 2 * x])
+    ts, ys = both(TS), (both(YS[0]), both(YS[1]))
+    with pytest.raises(ValueError, match=r"one solution, but has shape \(2, 2\)"):
+        balance(TERM, ts, ys)
+    with pytest.raises(ValueError, match="a state for each of the 2 times"):
+        balance(TERM, TS, (jnp.ones((3, 1)), jnp.ones((3, 1))))
+    each = jax.vmap(lambda ts, ys: balance(TERM, ts, ys))(ts, ys)
+    np.testing.assert_allclose(each[0], balance(TERM, TS, YS), atol=1e-12)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Inexact, PyTree
 
 from .. import _tree as tree
 from .._numbers import as_time, cast_to, State
+from .._scheme._engine import cheap_iterations
 from .._system._base import AbstractSystem
 
 
@@ -32,6 +33,10 @@ def energy(system: AbstractSystem, ts: Times, ys: State, args: PyTree = None) ->
 
     An array with an entry for each time. Where nothing was saved (`ts` is infinite
     beyond the last step of `SaveAt(steps=True)`) it is not finite either.
+
+    **Raises:**
+
+    `ValueError` if the solution is a batch: use `jax.vmap` for that.
     """
     return _at_each(_energy, system, ts, ys, args)
 
@@ -126,7 +131,7 @@ def _integral(
 ) -> Times:
     """The integral up to each saved time of a function of time and state, from the
     first that is not a gap in measured times."""
-    ts = as_time(ts)
+    ts = _checked(ts, ys)
     if not len(ts):
         return jnp.zeros_like(ts)
     eps = max(float(jnp.finfo(y.dtype).eps) for y in jtu.tree_leaves(ys))
@@ -156,11 +161,32 @@ def _integral(
     starts = jtu.tree_map(lambda y: y[last], ys)
     known = saved[1:] & saved[last]
     begin, end = (jnp.where(known, t, 0) for t in (ts[last], ts[1:]))
-    parts = jax.vmap(one)(begin, end, starts)
+    spans = begin, end, starts
+    # On a CPU one after the other: together each would take the steps of the longest.
+    in_turn = lambda: jax.lax.map(lambda span: one(*span), spans)
+    parts = in_turn() if cheap_iterations() else jax.vmap(one)(*spans)
     parts = jnp.where(known, parts, 0)
     return jnp.concatenate([jnp.zeros(1, parts.dtype), jnp.cumsum(parts)])
 
 
 @eqx.filter_jit
 def _at_each(fn: Callable, system: AbstractSystem, ts: Times, ys: State, args: PyTree):
-    return jax.vmap(lambda t, y: fn(system, t, y, args))(as_time(ts), ys)
+    return jax.vmap(lambda t, y: fn(system, t, y, args))(_checked(ts, ys), ys)
+
+
+def _checked(ts: Times, ys: State) -> Times:
+    ts = as_time(ts)
+    if jnp.ndim(ts) != 1:
+        each = "jax.vmap(lambda ts, ys: diagnostics.energy(system, ts, ys))(ts, ys)"
+        raise ValueError(
+            f"`ts` must be the saved times of one solution, but has shape {ts.shape}. "
+            f"Of a batch, write `{each}`, with the arguments of each member if they "
+            "differ."
+        )
+    shapes = [jnp.shape(y) for y in jtu.tree_leaves(ys)]
+    if any(shape[:1] != ts.shape for shape in shapes):
+        raise ValueError(
+            f"`ys` must have a state for each of the {len(ts)} times `ts`, but has "
+            f"arrays of shapes {', '.join(map(str, shapes))}."
+        )
+    return ts
