@@ -126,10 +126,14 @@ class Problem(eqx.Module):
             at_end = _Traced(end, n, start)
             some = system.friction is not None
 
-        outputs = [
-            _Traced(lambda t, y, fn=sub.fn: fn(t, y, system.args), t0, start[0])
-            for sub in subs
-        ]
+        interpolates = at_node is not None or at_end is not None
+
+        def output(t: Array, y: State, fn: Callable) -> PyTree:
+            # An interpolated attitude is not quite a unit quaternion.
+            y = system.term.project(t, y, system.args) if interpolates else y
+            return fn(t, y, system.args)
+
+        outputs = [_Traced(partial(output, fn=sub.fn), t0, start[0]) for sub in subs]
         within = _Traced(shorter, n, start, t0) if some else None
         several = within, at_node, at_end, outputs
         begins = None if begin is None else _Traced(begin, start[0])

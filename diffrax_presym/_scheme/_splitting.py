@@ -71,8 +71,7 @@ class AbstractSplitting(AbstractPresymplecticSolver):
         scheme = Scheme(
             MoveSequence(moves, spans),
             Enter(kind) if split.has_variables else None,
-            # Interpolated values would be off the manifold.
-            is_resolved=kind != "linear" and not system.term.is_constrained,
+            is_resolved=kind != "linear" and system.term.interpolates,
             most_friction=most,
             failure=split.failure,
             pattern=pattern,

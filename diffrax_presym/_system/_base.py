@@ -90,6 +90,11 @@ class AbstractSystem(dfx.AbstractTerm):
 
     is_constrained: ClassVar[bool] = False
 
+    @property
+    def interpolates(self) -> bool:
+        """Whether values between steps are interpolated, and projected."""
+        return not self.is_constrained
+
     def violation(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar | None:
         """By how much a state is off the manifold of the system, or its velocity off
         the tangent space; `None`, the default, if there is no such manifold."""

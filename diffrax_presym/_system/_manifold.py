@@ -113,6 +113,11 @@ class ManifoldSystem(AbstractSystem):
         return all(jtu.tree_leaves(self.map(lambda m: m.is_free)))
 
     @property
+    def interpolates(self) -> bool:
+        # Of others, derivatives along the motion take as long as a shorter step.
+        return self.is_free
+
+    @property
     def laws(self) -> tuple[AbstractFriction, ...]:
         return self.friction or ()
 
