@@ -26,8 +26,9 @@ class Drag(AbstractFriction):
     """Drag `-c |v| v` of each body by the square of its speed `|v|`: of air and water.
     (Stokes drag, by the speed, is `ViscousDamping`.)
 
-    For `MechanicalSystem`, with `QuadraticKinetic` and one mass for each body. Bodies
-    are the vectors over the last axis of `p`. Drag is part of the kicks: a symmetric
+    For `MechanicalSystem`, with `QuadraticKinetic` and one mass for each body, and for
+    `ManifoldSystem`, where that of an `Attitude` is a torque by its angular velocity.
+    Bodies are the vectors over the last axis of `p`. Drag is part of the kicks: a symmetric
     composition, of the order of the scheme, of the force and of drag alone, which keeps
     the direction and has a closed form. The force is evaluated once per kick. `Strang`,
     `BlanesMoan4` and `BlanesMoan6` keep their order; Runge--Kutta--Nyström splittings
