@@ -28,14 +28,14 @@ class Drag(AbstractFriction):
 
     For `MechanicalSystem`, with `QuadraticKinetic` and one mass for each body, and for
     `ManifoldSystem`, where that of an `Attitude` is a torque by its angular velocity.
-    Bodies are the vectors over the last axis of `p`. Drag is part of the kicks: a symmetric
-    composition, of the order of the scheme, of the force and of drag alone, which keeps
-    the direction and has a closed form. The force is evaluated once per kick. `Strang`,
-    `BlanesMoan4` and `BlanesMoan6` keep their order; Runge--Kutta--Nyström splittings
-    would not, and refuse it. No structure is kept but the symmetry. Of a few bodies the
-    same drag as `MechanicalSystem(..., force=f)` is faster. In a wind or a
-    current, give the velocity `w` of the `medium`: the drag is then
-    `-c |v - w| (v - w)`.
+    Bodies are the vectors over the last axis of `p`. Drag is part of the kicks: a
+    symmetric composition, of the order of the scheme, of the force and of drag alone,
+    which keeps the direction and has a closed form; on manifolds, of an implicit kick.
+    The force is evaluated once per kick. `Strang`, `BlanesMoan4` and `BlanesMoan6` keep
+    their order; Runge--Kutta--Nyström splittings would not, and refuse it. No structure
+    is kept but the symmetry. Of a few bodies the same drag as
+    `MechanicalSystem(..., force=f)` is faster. In a wind or a current, give the
+    velocity `w` of the `medium`: the drag is then `-c |v - w| (v - w)`.
 
     Schemes of order above 2 have stages backwards in time, during which drag
     accelerates. A solve fails if the momentum that a body loses over such a stage

@@ -19,7 +19,9 @@ class StepsBetween(dfx.AbstractStepSizeController):
     For a force or friction with kinks or jumps at known times, such as a table read by
     `jax.numpy.interp`: a step across a kink has order two at most, and one across a
     jump one, steps that end there keep the order of the scheme. Only the stages of
-    `SuzukiYoshida` go beyond the step, and see a jump too early. The steps between two
+    `SuzukiYoshida` go beyond the step, and see a jump too early; and in Diffrax's loop,
+    whose last step ends at `t1` whatever a controller says, schemes that end with a
+    kick see a jump at `t1` itself, in the last momentum. The steps between two
     of the times are equal, and as few as are not longer than `dt0`. In `float32` the
     times are rounded: shorter spans are wrong by as much, late in a long solve.
 

@@ -54,7 +54,10 @@ class ChosenStep(NamedTuple):
             "write `stepsize_controller=StepsBetween(times)`. At unknown times, as "
             "of a force by a mesh or a spline, values between steps suffer most: give "
             "it the saved times, if they are few. With a force that changes fast, as "
-            "dry friction that is smoothed, use an adaptive solver."
+            "dry friction that is smoothed, use an adaptive solver. Of a smooth motion "
+            "with few steps to a period of a drive errors may be irregular too, and "
+            "with a `tolerance` of `PresymplecticGauss` that is not a hundredth of the "
+            "error they cease to fall."
         )
         limit = (
             " Steps that are not much longer are unstable, or miss an event: for other "
