@@ -130,6 +130,13 @@ def test_figures():
     np.testing.assert_allclose(np.diff(np.log(y)) / np.diff(np.log(x)), 4.0)
 
 
+def test_a_figure_is_of_one_solution():
+    batch = jax.vmap(TUNED)(jnp.array([0.5, 0.25]))
+    for draw in (plot_phase, lambda sol: plot_energy(SYSTEM, sol)):
+        with pytest.raises(ValueError, match="saved times of one solution"):
+            draw(batch)
+
+
 def test_without_matplotlib(monkeypatch):
     given = builtins.__import__
 

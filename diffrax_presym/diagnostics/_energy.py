@@ -131,7 +131,7 @@ def _integral(
 ) -> Times:
     """The integral up to each saved time of a function of time and state, from the
     first that is not a gap in measured times."""
-    ts = _checked(ts, ys)
+    ts = checked(ts, ys)
     if not len(ts):
         return jnp.zeros_like(ts)
     eps = max(float(jnp.finfo(y.dtype).eps) for y in jtu.tree_leaves(ys))
@@ -171,10 +171,11 @@ def _integral(
 
 @eqx.filter_jit
 def _at_each(fn: Callable, system: AbstractSystem, ts: Times, ys: State, args: PyTree):
-    return jax.vmap(lambda t, y: fn(system, t, y, args))(_checked(ts, ys), ys)
+    return jax.vmap(lambda t, y: fn(system, t, y, args))(checked(ts, ys), ys)
 
 
-def _checked(ts: Times, ys: State) -> Times:
+def checked(ts: Times, ys: State) -> Times:
+    """The times of one solution; an error if it is a batch."""
     ts = as_time(ts)
     if jnp.ndim(ts) != 1:
         each = "jax.vmap(lambda ts, ys: diagnostics.energy(system, ts, ys))(ts, ys)"

@@ -9,7 +9,7 @@ from jaxtyping import PyTree
 
 from .._step_size._solution import check_times, scaled_error, Solution
 from .._system._base import AbstractSystem
-from ._energy import energy, energy_error
+from ._energy import checked, energy, energy_error
 from ._work_precision import Solve, WorkPrecision
 
 
@@ -28,6 +28,10 @@ def plot_energy(
     **Returns:**
 
     The two axes.
+
+    **Raises:**
+
+    `ValueError` if the solution is a batch.
     """
     if axes is None:
         axes = _pyplot().subplots(2, sharex=True, layout="constrained")[1]
@@ -52,7 +56,13 @@ def plot_phase(sol: dfx.Solution, axes: Any = None, most: int = 6):
     **Returns:**
 
     The axes.
+
+    **Raises:**
+
+    `ValueError` if the solution is a batch.
     """
+    assert sol.ts is not None and sol.ys is not None
+    checked(sol.ts, sol.ys)
     axes = _axes(axes)
     rows = [np.asarray(x).reshape(len(x), -1) for x in jax.tree.leaves(sol.ys)]
     half = len(rows) // 2
