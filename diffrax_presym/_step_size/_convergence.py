@@ -107,7 +107,7 @@ def find_steps(
             continue
         doubted = None
         if high.error > 1:
-            _check_rounding(law, last)
+            _check_rounding(law)
             _check_hopeless(law, high, max_steps)
     if doubted is None:
         raise RuntimeError(_exceeds(law, max_steps))
@@ -172,13 +172,11 @@ def _smallest(law: Law, failed: list[Trial], high: Trial, grid: Grid, measure) -
     return high
 
 
-def _check_rounding(law: Law, coarse: Solution):
+def _check_rounding(law: Law):
     """An error if solves have stopped converging, in the precision of the state."""
-    fine = law.finest
-    if not (coarse.finite and fine.finite and all(x < 0.5 for x in law.orders[-2:])):
+    change, eps, precision = law.change, law.eps, law.precision
+    if precision is None or not all(x < 0.5 for x in law.orders[-2:]):
         return
-    precision, change = coarse.relative_change(fine)
-    eps = float(np.finfo(precision).eps)
     settled = 0.65 * (law.claimed or 2)
     settled = any(law.exceeds(settled, i) for i in range(3, len(law.orders)))
     if change < 1e3 * eps or (settled and change < eps**0.5):

@@ -45,18 +45,26 @@ class Law(NamedTuple):
     finest: Solution
     claimed: int | None
     tolerances: tuple[float, float]
-    by_rounding: bool = False  # whether the last difference may be
+    # Of the last two solutions, by how much they differ relative to their size, and to
+    # what that is rounded.
+    change: float = math.inf
+    precision: np.dtype | None = None
     extrapolates: bool = True  # not if most of the differences are by rounding
 
     def add(self, finer: Solution) -> "Law":
         law = self._replace(finest=finer, claimed=finer.order or self.claimed)
         last = self.finest
         step = Trial(last.steps, law.difference(last), last.number)
-        may_be = False
+        change, precision = math.inf, None
         if last.finite and finer.finite:
-            precision, change = last.relative_change(finer)
-            may_be = change <= float(np.finfo(precision).eps) * finer.steps
-        return law._replace(ladder=(*self.ladder, step), by_rounding=may_be)
+            change, precision = last.relative_change(finer)
+        ladder = *self.ladder, step
+        return law._replace(ladder=ladder, change=change, precision=precision)
+
+    @property
+    def eps(self) -> float:
+        """The relative rounding of the last two solutions, if both are finite."""
+        return 0.0 if self.precision is None else float(np.finfo(self.precision).eps)
 
     @property
     def orders(self) -> list[float]:
@@ -91,7 +99,8 @@ class Law(NamedTuple):
         errors of rounding."""
         two = self.ladder[-2:]
         seen = len(two) == 2 and two[0].steps >= SEEING and self.orders[-1] < 0
-        return seen and self.by_rounding and max(x.error for x in two) <= 1
+        by_rounding = self.change <= self.eps * self.finest.steps
+        return seen and by_rounding and max(x.error for x in two) <= 1
 
     def difference(self, solution: Solution) -> float:
         if not (solution.finite and self.finest.finite):

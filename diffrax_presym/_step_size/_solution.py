@@ -96,7 +96,7 @@ class Solution(NamedTuple):
             bool(sol.result == STEP_DENSITY_MISSED),
         )
 
-    def relative_change(self, finer: "Solution") -> tuple[np.dtype, float]:
+    def relative_change(self, finer: "Solution") -> tuple[float, np.dtype]:
         """By how much another solution is different, relative to the size of what is
         saved, and the lowest precision of that."""
         pairs = zip(self.leaves, finer.leaves, strict=True)
@@ -104,7 +104,7 @@ class Solution(NamedTuple):
         precision = max((b.dtype for _, b in pairs), key=lambda x: np.finfo(x).eps)
         size = lambda x: np.max(np.abs(x), initial=0)
         change = lambda a, b: float(size(a - b) / max(size(b), 1e-300))
-        return precision, max(change(*pair) for pair in pairs)
+        return max(change(*pair) for pair in pairs), precision
 
     def check_precision(self, rtol: float, atol: float):
         """An error if what is saved is rounded to less than the tolerance, so that

@@ -117,10 +117,11 @@ class ConstrainedSplit(AbstractSplit):
         # What it would gain along the normals may lead to other points of the
         # constraint.
         change = lambda x: system.term.to_tangent(t, q, x, system.args, flow=0.0)
+        along = lambda x: tree.add(x, change(x))
         if self.base.kick_by != "friction":
-            return tree.add(force, change(force))
+            return along(force)
         force, *friction = force
-        return tree.add(force, change(force)), *friction
+        return along(force), *friction
 
     def kick(self, system, t, h, y, force, order) -> State:
         free, q = _free(system), tree.values(y)[0]

@@ -181,8 +181,8 @@ def checked(ts: Times, ys: State) -> Times:
         each = "jax.vmap(lambda ts, ys: diagnostics.energy(system, ts, ys))(ts, ys)"
         raise ValueError(
             f"`ts` must be the saved times of one solution, but has shape {ts.shape}. "
-            f"Of a batch, write `{each}`, with the arguments of each member if they "
-            "differ."
+            f"Take one member of a batch, or write `{each}`, with the arguments of "
+            "each member if they differ."
         )
     shapes = [jnp.shape(y) for y in jtu.tree_leaves(ys)]
     if any(shape[:1] != ts.shape for shape in shapes):
