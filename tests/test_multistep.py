@@ -298,6 +298,24 @@ def test_a_force_that_passes_through_zero():
     assert_close(ys, ends(term, EXACT, 0.0, 100.0, 0.1, y0), 1e-3)
 
 
+@pytest.mark.parametrize("heavy", [1.0, 1e2, 1e6])
+def test_a_light_body_that_is_ejected(heavy):
+    """Beside a heavy one, whose steps are short enough."""
+    mass = jnp.array([1.0, heavy])
+    attraction = lambda t, q, args: -jnp.sum(mass / jnp.linalg.norm(q, axis=1))
+    term = dps.MechanicalSystem(dps.QuadraticKinetic(mass[:, None]), attraction)
+    v = jnp.array([[0.0, 1.5**0.5], [0.0, 0.3**0.5]])
+    y0 = term.from_velocity(0.0, (jnp.array([[0.8, 0.0], [4.0, 0.0]]), v))
+    for steps, good in ((24, False), (60, True)):
+        times = 0.0, 200 * np.pi, 2 * np.pi / steps
+        sol: Any = solve(
+            *(term, dps.SymmetricMultistep(8), *times, y0),
+            **dict(adjoint=FIXED, max_steps=None, throw=False),
+        )
+        assert (sol.result == MULTISTEP_UNSTABLE) != good
+        assert (jnp.linalg.norm(sol.ys[0][-1, 0]) < 1.3) == good
+
+
 def test_bad_input():
     order: Any
     for order in (4, 9, 12, 8.0, True):
