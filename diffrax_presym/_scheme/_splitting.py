@@ -71,7 +71,9 @@ class AbstractSplitting(AbstractPresymplecticSolver):
         scheme = Scheme(
             MoveSequence(moves, spans),
             Enter(kind) if split.has_variables else None,
-            is_resolved=kind != "linear" and system.term.interpolates,
+            is_resolved=kind != "linear"
+            and split.is_resolved
+            and system.term.interpolates,
             most_friction=most,
             failure=split.failure,
             pattern=pattern,

@@ -1,5 +1,5 @@
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -20,6 +20,7 @@ class BregmanSplit(AbstractSplit):
     objective."""
 
     kinds: frozenset[str] = eqx.field(static=True)
+    is_resolved: ClassVar[bool] = True
 
     def prepare(self, system, t, h, order) -> PyTree:
         friction: Any = system.friction  # there always is some

@@ -49,6 +49,7 @@ class PotentialSplit(AbstractSplit):
         static=True, default=frozenset({"any", "nystrom"})
     )
     names: ClassVar[tuple[str, str]] = ("move", "push")
+    is_resolved: ClassVar[bool] = True
 
     def quadrature(self, system, order) -> int:
         return 0 if system.friction is None or system.friction.is_known else order
@@ -82,6 +83,7 @@ class SharedSplit(AbstractSplit):
 
     kinds: frozenset[str] = eqx.field(static=True)
     names: ClassVar[tuple[str, str]] = ("shared kick", "shared drift")
+    is_resolved: ClassVar[bool] = True
 
     def _shift(self, system: "System", t: Time, y: State, sign: float) -> State:
         law = system.term.damping

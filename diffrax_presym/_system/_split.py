@@ -86,6 +86,10 @@ class AbstractSplit(eqx.Module):
         default."""
         return None
 
+    # Whether steps show the motion between them: not if a drift may turn by far within
+    # one. Otherwise values between steps are shorter steps.
+    is_resolved: ClassVar[bool] = False
+
     failure: ClassVar[Any] = NONFINITE  # the reason if a state is not finite
 
     def kick(
