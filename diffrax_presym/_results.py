@@ -57,6 +57,14 @@ FORCE_NOT_SOLVED = _entry(
     "`friction=ViscousDamping(C)`, also with a function `C(t, q, args)`; or use "
     "`PresymplecticGauss(stages, optimistix.Newton(rtol, atol))`, but on manifolds.",
 )
+TURNS_TOO_FAR = _entry(
+    "turns_too_far",
+    "The state left the finite numbers; or a rigid body, which had turned slowly, "
+    "turns by more than three radians in a step within which values are saved, too far "
+    "to interpolate them; or its momentum turns relative to it by more than half of a "
+    "circle. Take shorter steps, or steps that end at all saved times: "
+    "`stepsize_controller=StepsBetween(ts)`.",
+)
 ENERGY_NOT_DEFINED = _entry(
     "energy_not_defined",
     "At the end of a step, whose state is finite, the energy is not defined: the mass "

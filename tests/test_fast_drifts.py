@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import diffrax_presym as dps
+from diffrax_presym._results import TURNS_TOO_FAR
 from diffrax_presym.extend import AbstractSplit
 
 
@@ -49,3 +50,45 @@ def test_of_a_split_of_the_user(solver, vary):
     )
     exact = start[None] * jnp.cos(jnp.outer(TIMES, OMEGA))
     np.testing.assert_allclose(sol.ys[0], exact, atol=1e-11)
+
+
+def spinning(rate, steps, vary=False, law=None, **options):
+    """A top that starts at a rate of spin, and its values between steps of 0.2."""
+    turn = dps.Attitude(jnp.array([1.0, 1.0, 0.5]))
+    weight = lambda t, q, args: 0.1 * dps.rotation_matrix(q)[2, 2]
+    system = dps.ManifoldSystem(turn, weight, law)
+    y0 = jnp.array([0.8, 0.6, 0.0, 0.0]), jnp.array([0.1, 0.2, rate / 2])
+    if vary:
+        control = dps.StepDensityController(4.0 / steps, lambda t, y, args: 1.0)
+        options["stepsize_controller"] = control
+    return diffeqsolve(
+        *(system, dps.TunedRKN6(), 0.0, 4.0, None if vary else 4.0 / steps, y0),
+        saveat=dfx.SaveAt(ts=TIMES * 0.4),
+        adjoint=dps.FixedStepAdjoint(),
+        max_steps=None,
+        **options,
+    )
+
+
+@pytest.mark.parametrize("vary", [False, True], ids=["equal", "variable"])
+@pytest.mark.parametrize("rate, most", [(5.0, 1e-8), (30.0, 1e-8), (100.0, 1e-4)])
+def test_of_a_body(rate, most, vary):
+    sol, exact = spinning(rate, 20, vary), spinning(rate, 1480)
+    assert (sol.stats["interpolated"] > 0) == (rate == 5.0)
+    for x, y in zip(sol.ys, exact.ys, strict=True):
+        np.testing.assert_allclose(x, y, atol=most)
+
+
+@pytest.mark.parametrize("vary", [False, True], ids=["equal", "variable"])
+def test_of_a_body_that_spins_up(vary):
+    """Steps that are equal fail where it turns too far in one."""
+    law = dps.ConstantDamping(-0.4)
+    sol = spinning(6.0, 30, vary, law, throw=False)
+    exact = spinning(6.0, 1480, law=law)
+    assert jnp.linalg.norm(exact.ys[1][-1]) > 14
+    assert (sol.result == TURNS_TOO_FAR) == (not vary)
+    for x, y in zip(sol.ys, exact.ys, strict=True):
+        known = jnp.isfinite(x)
+        assert jnp.all(known) == vary
+        assert jnp.mean(known) > 0.6
+        np.testing.assert_allclose(x[known], y[known], atol=1e-7)

@@ -21,6 +21,9 @@ from .._system._bound import System
 MOST_FRICTION = 0.5
 # The same of those over several steps, at a constant rate: no singularity is near.
 MOST_CONSTANT = 1.5
+# The largest angle by which a drift may turn in a step that polynomials are to follow:
+# values between steps are then as accurate as these, also where it grows to twice that.
+MOST_TURN = 1.5
 # More than any solve takes, in integers of either precision.
 MOST_STEPS = 2**30
 

@@ -20,7 +20,7 @@ from .. import _tree as tree
 from .._numbers import cast_to, rounding_of, State
 from .._scheme._base import Point, Scheme
 from .._system._bound import System
-from ._base import MOST_FRICTION, MOST_STEPS
+from ._base import MOST_FRICTION, MOST_STEPS, MOST_TURN
 from ._rows import Rows, stops_due
 from ._steps import Steps
 
@@ -95,7 +95,18 @@ def node(
     point = steps.renewed(scheme, system, n, system.time(t), point)
     if system.external is not None:
         moment = _moment(jnp.where(side < 0, -h, h))
-    return derivatives(scheme, system, t, point, moment, number)
+    known = derivatives(scheme, system, t, point, moment, number)
+    follows = turns_little(system, h, point[0], 2 * MOST_TURN)
+    return known if follows is None else tree.invalid_if(~follows, known)
+
+
+def turns_little(
+    system: System, h: Array, y: State, most: float = MOST_TURN
+) -> Bool[Array, ""] | None:
+    """Whether a drift of a length turns a state by an angle that polynomials follow;
+    `None` if no drift turns it."""
+    rate = system.term.turning(*system.values(y))
+    return None if rate is None else lax.stop_gradient(jnp.abs(h) * rate <= most)
 
 
 def _moment(h: Array) -> Array:
@@ -137,6 +148,8 @@ def first_node(system: System, steps: Steps, last: Array, y: State) -> Int[Array
         h = steps.longest
         most = jnp.abs(h) * _rate(system, system.time(steps.t0), y, h) / 2
         yes &= most <= MOST_FRICTION
+    if (follows := turns_little(system, steps.longest, y)) is not None:
+        yes &= follows
     return lax.stop_gradient(jnp.where(yes, first, MOST_STEPS))
 
 

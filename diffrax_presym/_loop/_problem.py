@@ -122,9 +122,10 @@ class Problem(eqx.Module):
         known = resolved and not system.has_unknown_friction
         if isinstance(steps, VariableSteps) and some and known:
             rates = None if system.friction is None else system.friction.by_rates()
+            end_turns = system.term.turning(*system.values(start[0])) is not None
             end = partial(end_of_step, scheme, system, steps, rates)
             at_end = _Traced(end, n, start)
-            some = system.friction is not None
+            some = system.friction is not None or end_turns
 
         interpolates = at_node is not None or at_end is not None
 

@@ -21,7 +21,7 @@ from .._numbers import cast_to, State
 from .._scheme._base import Point, Scheme
 from .._system._bound import System
 from ._base import follows, MOST_STEPS, Stop
-from ._nodes import DERIVATIVES, derivatives, hermite, Node
+from ._nodes import DERIVATIVES, derivatives, hermite, Node, turns_little
 from ._tracks import AbstractTrack, apart, put_here, stack, where_any
 from ._variable import VariableSteps
 
@@ -47,8 +47,10 @@ def end_of_step(
     carry, _ = steps.split(solver_state)
     begin, h = steps.begin(n, point), steps.end(n, point) - steps.begin(n, point)
     node = derivatives(scheme, system, begin, (y, carry))
+    little = turns_little(system, h, y)
     h = cast_to(system.direction, h) * h
     smooth = follows(friction, system.time(begin), h)
+    smooth = smooth if little is None else smooth & little
     return End(steps.time(point), node), jnp.asarray(smooth)
 
 

@@ -83,6 +83,9 @@ class Attitude(AbstractManifold):
         turn = p / cast_to(self.inertia, p) / 2
         return multiply(q, jnp.concatenate([jnp.zeros_like(q[..., :1]), turn], axis=-1))
 
+    def turning(self, q: Array, p: Array) -> Array:
+        return size(p / cast_to(self.inertia, p))
+
     def rates(self, q: Array, p: Array) -> Both:
         turn = jnp.cross(p, p / cast_to(self.inertia, p))
         return self.velocity(q, p), turn

@@ -95,6 +95,11 @@ class AbstractSystem(dfx.AbstractTerm):
         """Whether values between steps are interpolated, and projected."""
         return not self.is_constrained
 
+    def turning(self, q: Q, p: P) -> Scalar | None:
+        """The largest rate at which a state turns without forces; `None`, the default,
+        if it moves along straight lines."""
+        return None
+
     def violation(self, t: Time, q: Q, p: P, args: PyTree = None) -> Scalar | None:
         """By how much a state is off the manifold of the system, or its velocity off
         the tangent space; `None`, the default, if there is no such manifold."""

@@ -19,6 +19,7 @@ from .._friction._damping import as_laws
 from .._friction._fit import has_rates
 from .._friction._linear import LinearFriction
 from .._numbers import as_time, cast_to, Scalar, State, Time
+from .._results import TURNS_TOO_FAR
 from ._base import AbstractSystem, P, Q
 from ._force_split import AbstractForceSplit
 from ._manifolds import AbstractManifold, unitless
@@ -116,6 +117,9 @@ class ManifoldSystem(AbstractSystem):
     def interpolates(self) -> bool:
         # Of others, derivatives along the motion take as long as a shorter step.
         return self.is_free
+
+    def turning(self, q: Q, p: P) -> Scalar:
+        return tree.largest(self._each("turning", q, p))
 
     @property
     def laws(self) -> tuple[AbstractFriction, ...]:
@@ -251,6 +255,10 @@ class ManifoldSplit(AbstractForceSplit):
 
     kinds: frozenset[str] = eqx.field(static=True)
     kick_by: str = eqx.field(static=True)
+
+    @property
+    def failure(self):
+        return super().failure if self.kick_by == "momentum" else TURNS_TOO_FAR
 
     def quadrature(self, system, order) -> int:
         return 0 if system.friction is None or system.friction.is_known else order

@@ -46,6 +46,10 @@ class AbstractManifold(eqx.Module):
         zero, one = jnp.zeros((), p.dtype), jnp.ones((), p.dtype)
         return jax.jvp(lambda s: self.flow(q, p, s), (zero,), (one,))[1]
 
+    def turning(self, q: Array, p: Array) -> Array:
+        """The rates at which a position that `is_free` turns, by default zero."""
+        return jnp.zeros((), p.dtype)
+
     def momenta(self, q: tuple[int, ...]) -> tuple[int, ...] | None:
         """The shape of the momenta of positions of a shape, by default the same; `None`
         if positions do not have that shape."""
