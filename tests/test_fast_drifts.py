@@ -20,7 +20,7 @@ TIMES = jnp.linspace(0.0, 10.0, 38)
 class Oscillations(AbstractSplit):
     """Two oscillators, exactly."""
 
-    kinds: ClassVar = frozenset({"any", "nystrom"})
+    kinds: ClassVar[frozenset[str]] = frozenset({"any", "nystrom"})
 
     def drift(self, system, t, h, data, y):
         (q, p), c, s = system.values(y), jnp.cos(OMEGA * h), jnp.sin(OMEGA * h)
