@@ -30,6 +30,15 @@ class Oscillations(AbstractSplit):
         return jnp.zeros(2)
 
 
+def test_friction_that_a_split_omits_is_refused():
+    energy = lambda t, q, p, args: jnp.sum(OMEGA * (q**2 + p**2)) / 2
+    law = dps.ConstantDamping(0.1)
+    system = dps.Hamiltonian(energy, law, splits=(Oscillations(),))
+    y0 = jnp.ones(2), jnp.zeros(2)
+    with pytest.raises(ValueError, match="`Oscillations` would omit the friction"):
+        diffeqsolve(system, dps.BlanesMoan6(), 0.0, 1.0, 0.1, y0)
+
+
 @pytest.mark.parametrize(
     "solver",
     [dps.BlanesMoan6(), dps.TunedRKN6(), dps.SofroniouSpaletta(6, dps.Strang())],

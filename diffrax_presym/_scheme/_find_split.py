@@ -11,6 +11,15 @@ def find_split(
     """The split that a scheme uses; an error if the system has none of this kind."""
     split, name = system.split(kind), type(solver).__name__
     if split is not None:
+        own, base = type(split), AbstractSplit
+        omits = own.prepare is base.prepare and own.kick is base.kick
+        if system.term.laws and omits:
+            raise ValueError(
+                f"`{own.__name__}` would omit the friction of this "
+                f"`{system.name}`. Return `system.friction.prepare(t, h, order)` from "
+                "`prepare(self, system, t, h, order)` of the split, and apply it in "
+                "`drift`, as of `system.friction.flow(data, p)`."
+            )
         return split
     if kind == "nystrom" and system.term.is_constrained:
         raise ValueError(
