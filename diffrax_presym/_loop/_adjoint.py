@@ -46,9 +46,10 @@ class FixedStepAdjoint(dfx.AbstractAdjoint):
     times, `StepsBetween(ts)`. Across kinks in time it is wrong: give these to
     `StepsBetween`, also where steps of one length end at all of them. Where it cannot
     follow the motion, it is a shorter step: of schemes up to order two, of
-    `TunedLinear8`, of systems with constraints or on a `Sphere` or a `Stiefel`, in
-    spans of fewer than three steps, where neighbouring steps of `diffrax.StepTo` differ
-    by more than a factor of two, and where friction over a step is more than 1.5, or a
+    `TunedLinear8`, of splits of a user, of systems with constraints or on a `Sphere` or
+    a `Stiefel`, of bodies that turn by more than 1.5 radians in a step, in spans of
+    fewer than three steps, where neighbouring steps of `diffrax.StepTo` differ by more
+    than a factor of two, and where friction over a step is more than 1.5, or a
     matrix turns momenta by more than as many radians, or 0.5 if its rate depends on
     time, unless the motion starts where it is infinite; and where that has no second
     derivative. Interpolated attitudes of bodies are normalised. The
