@@ -86,8 +86,8 @@ ROOT_NOT_FOUND = _entry(
 MULTISTEP_UNSTABLE = _entry(
     "multistep_unstable",
     "`SymmetricMultistep` is unstable: the step times the highest frequency of the "
-    "system is more than 0.63 (order 8) or 0.48 (order 10). "
-    "Take shorter steps, or use `TunedRKN6()`.",
+    "system is more than 0.63 (order 8) or 0.48 (order 10), or on eccentric orbits "
+    "less. Take shorter steps, or use `TunedRKN6()`.",
 )
 OTHER_HISTORY = _entry(
     "other_history",

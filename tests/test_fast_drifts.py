@@ -3,6 +3,7 @@
 from typing import Any, ClassVar
 
 import diffrax as dfx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -61,7 +62,7 @@ def test_of_a_split_of_the_user(solver, vary):
     np.testing.assert_allclose(sol.ys[0], exact, atol=1e-11)
 
 
-def spinning(rate, steps, vary=False, law=None, **options):
+def spinning(rate, steps, vary=False, law=None, sign=1, **options):
     """A top that starts at a rate of spin, and its values between steps of 0.2."""
     turn = dps.Attitude(jnp.array([1.0, 1.0, 0.5]))
     weight = lambda t, q, args: 0.1 * dps.rotation_matrix(q)[2, 2]
@@ -70,13 +71,11 @@ def spinning(rate, steps, vary=False, law=None, **options):
     if vary:
         control = dps.StepDensityController(4.0 / steps, lambda t, y, args: 1.0)
         options["stepsize_controller"] = control
-    return diffeqsolve(
-        *(system, dps.TunedRKN6(), 0.0, 4.0, None if vary else 4.0 / steps, y0),
-        saveat=dfx.SaveAt(ts=TIMES * 0.4),
-        adjoint=dps.FixedStepAdjoint(),
-        max_steps=None,
-        **options,
-    )
+    options = {"adjoint": dps.FixedStepAdjoint(), "max_steps": None} | options
+    end, dt0 = sign * 4.0, None if vary else sign * 4.0 / steps
+    saveat = dfx.SaveAt(ts=TIMES * 0.4 * sign)
+    args = system, dps.TunedRKN6(), 0.0, end, dt0, y0
+    return diffeqsolve(*args, saveat=saveat, **options)
 
 
 @pytest.mark.parametrize("vary", [False, True], ids=["equal", "variable"])
@@ -101,3 +100,19 @@ def test_of_a_body_that_spins_up(vary):
         assert jnp.all(known) == vary
         assert jnp.mean(known) > 0.6
         np.testing.assert_allclose(x[known], y[known], atol=1e-7)
+
+
+@pytest.mark.parametrize("gradient", ["reversal", "checkpoints"])
+@pytest.mark.parametrize("sign", [1, -1], ids=["forwards", "backwards"])
+def test_gradients_of_slow_and_fast_bodies_of_a_batch(gradient, sign):
+    def loss(rate):
+        options: dict = dict(adjoint=dps.FixedStepAdjoint(gradient), max_steps=64)
+        q, p = spinning(rate, 20, sign=sign, **options).ys
+        return jnp.sum(q**3) + jnp.sum(p[:, :2] ** 2)
+
+    rates, h = jnp.array([5.0, 30.0]), 1e-5
+    values = jax.jit(jax.vmap(jax.value_and_grad(loss)))(rates)
+    each = jax.jit(lambda rates: jax.lax.map(loss, rates))
+    np.testing.assert_allclose(values[0], each(rates), rtol=1e-12)
+    central = (each(rates + h) - each(rates - h)) / (2 * h)
+    np.testing.assert_allclose(values[1], central, rtol=1e-6)

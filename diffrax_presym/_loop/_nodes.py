@@ -83,12 +83,14 @@ def node(
     system: System,
     steps: Steps,
     number: int,
+    first: Array,
     n: Array,
     side: Array,
     point: Point,
 ) -> Node:
     """The state at the start of a step, and a number of its derivatives: where they
-    jump, those before it (-1) or after it (1)."""
+    jump, those before it (-1) or after it (1). Not numbers if a body turns too far, but
+    in a member of a batch that needs no nodes, as it has no `first` one."""
     t, h, moment = steps.time(n), steps.lengths(n), None
     # A function of time may itself round to the other side.
     t = t + cast_to(side, t) * rounding_of(steps.t0, t, h)
@@ -96,17 +98,17 @@ def node(
     if system.external is not None:
         moment = _moment(jnp.where(side < 0, -h, h))
     known = derivatives(scheme, system, t, point, moment, number)
-    follows = turns_little(system, h, point[0], 2 * MOST_TURN)
-    return known if follows is None else tree.invalid_if(~follows, known)
+    little = turns_little(system, h, point[0], 2 * MOST_TURN)
+    if little is True:
+        return known
+    return tree.invalid_if(~little & (first < MOST_STEPS), known)
 
 
-def turns_little(
-    system: System, h: Array, y: State, most: float = MOST_TURN
-) -> Bool[Array, ""] | None:
-    """Whether a drift of a length turns a state by an angle that polynomials follow;
-    `None` if no drift turns it."""
+def turns_little(system: System, h: Array, y: State, most: float = MOST_TURN) -> Any:
+    """Whether polynomials can follow a drift of a length, which turns a state; `True`
+    if it never does."""
     rate = system.term.turning(*system.values(y))
-    return None if rate is None else lax.stop_gradient(jnp.abs(h) * rate <= most)
+    return True if rate is None else jnp.abs(h) * rate <= most
 
 
 def _moment(h: Array) -> Array:
@@ -148,8 +150,7 @@ def first_node(system: System, steps: Steps, last: Array, y: State) -> Int[Array
         h = steps.longest
         most = jnp.abs(h) * _rate(system, system.time(steps.t0), y, h) / 2
         yes &= most <= MOST_FRICTION
-    if (follows := turns_little(system, steps.longest, y)) is not None:
-        yes &= follows
+    yes &= turns_little(system, steps.longest, y)
     return lax.stop_gradient(jnp.where(yes, first, MOST_STEPS))
 
 

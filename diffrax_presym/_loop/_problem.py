@@ -110,10 +110,9 @@ class Problem(eqx.Module):
         resolved = scheme.is_resolved and solver.order(None) > 2
         if isinstance(steps, Steps) and some and resolved:
             each = number_of_derivatives(solver.order(None))
-            at_node = _Traced(
-                partial(node, scheme, system, steps, each), *(n, n, start)
-            )
             first = first_node(system, steps, self.last, start[0])
+            nodes = partial(node, scheme, system, steps, each, first)
+            at_node = _Traced(nodes, n, n, start)
             for i, rows in enumerate(self.rows):
                 if rows.may_be_inside:
                     stencils = Stencils(steps, rows, self.last, first, each)
@@ -122,10 +121,10 @@ class Problem(eqx.Module):
         known = resolved and not system.has_unknown_friction
         if isinstance(steps, VariableSteps) and some and known:
             rates = None if system.friction is None else system.friction.by_rates()
-            end_turns = system.term.turning(*system.values(start[0])) is not None
             end = partial(end_of_step, scheme, system, steps, rates)
             at_end = _Traced(end, n, start)
-            some = system.friction is not None or end_turns
+            turning = system.term.turning(*system.values(start[0]))
+            some = system.friction is not None or turning is not None
 
         interpolates = at_node is not None or at_end is not None
 

@@ -47,10 +47,9 @@ def end_of_step(
     carry, _ = steps.split(solver_state)
     begin, h = steps.begin(n, point), steps.end(n, point) - steps.begin(n, point)
     node = derivatives(scheme, system, begin, (y, carry))
-    little = turns_little(system, h, y)
+    smooth = turns_little(system, h, y)
     h = cast_to(system.direction, h) * h
-    smooth = follows(friction, system.time(begin), h)
-    smooth = smooth if little is None else smooth & little
+    smooth &= follows(friction, system.time(begin), h)
     return End(steps.time(point), node), jnp.asarray(smooth)
 
 

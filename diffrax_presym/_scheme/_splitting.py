@@ -71,9 +71,7 @@ class AbstractSplitting(AbstractPresymplecticSolver):
         scheme = Scheme(
             MoveSequence(moves, spans),
             Enter(kind) if split.has_variables else None,
-            is_resolved=kind != "linear"
-            and split.is_resolved
-            and system.term.interpolates,
+            is_resolved=kind != "linear" and split.is_resolved,
             most_friction=most,
             failure=split.failure,
             pattern=pattern,

@@ -90,11 +90,6 @@ class AbstractSystem(dfx.AbstractTerm):
 
     is_constrained: ClassVar[bool] = False
 
-    @property
-    def interpolates(self) -> bool:
-        """Whether values between steps are interpolated, and projected."""
-        return not self.is_constrained
-
     def turning(self, q: Q, p: P) -> Scalar | None:
         """The largest rate at which a state turns without forces; `None`, the default,
         if it moves along straight lines."""

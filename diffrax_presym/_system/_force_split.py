@@ -3,7 +3,7 @@
 import abc
 import math
 from collections.abc import Callable
-from typing import ClassVar, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -38,7 +38,6 @@ class AbstractForceSplit(AbstractSplit):
 
     # "force" alone, with "friction", or by an equation for the "momentum".
     kick_by: eqx.AbstractVar[str]
-    is_resolved: ClassVar[bool] = True
 
     @abc.abstractmethod
     def place_force(self, system: "System", t: Time, y: State) -> PyTree:

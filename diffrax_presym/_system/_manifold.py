@@ -113,11 +113,6 @@ class ManifoldSystem(AbstractSystem):
     def is_free(self) -> bool:
         return all(jtu.tree_leaves(self.map(lambda m: m.is_free)))
 
-    @property
-    def interpolates(self) -> bool:
-        # Of others, derivatives along the motion take as long as a shorter step.
-        return self.is_free
-
     def turning(self, q: Q, p: P) -> Scalar:
         return tree.largest(self._each("turning", q, p))
 
@@ -140,7 +135,8 @@ class ManifoldSystem(AbstractSystem):
         # Other friction would be part of the kicks, or make a drift several.
         is_drift = kick_by == "force" and has_rates(parts)
         nystrom = {"nystrom"} if is_drift else set()
-        return (ManifoldSplit(frozenset({"any"} | nystrom), kick_by),)
+        kinds = frozenset({"any"} | nystrom)
+        return (ManifoldSplit(kinds=kinds, kick_by=kick_by, is_resolved=self.is_free),)
 
     def check_state(self, y: PyTree) -> None:
         wanted = jtu.tree_structure(self.manifold, is_leaf=_is_manifold)
@@ -255,6 +251,8 @@ class ManifoldSplit(AbstractForceSplit):
 
     kinds: frozenset[str] = eqx.field(static=True)
     kick_by: str = eqx.field(static=True)
+    # Of others, derivatives along the motion take as long as a shorter step.
+    is_resolved: bool = eqx.field(static=True)
 
     @property
     def failure(self):

@@ -26,6 +26,7 @@ class KineticSplit(AbstractForceSplit):
 
     kinds: frozenset[str] = eqx.field(static=True)
     kick_by: str = eqx.field(static=True, default="force")
+    is_resolved: ClassVar[bool] = True
 
     def quadrature(self, system, order) -> int:
         return 0 if system.term.kinetic.flow_is_known(system.friction) else order
