@@ -14,6 +14,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Inexact, PyTree
 
+from . import _tree as tree
 from ._checks import as_finite, as_parameter, as_positive
 from ._implicit import solve_linear
 from ._numbers import cast_to
@@ -31,6 +32,10 @@ _MASSLESS = (
     " For massless test particles let `p` be the momentum per unit mass: "
     "`MechanicalSystem(QuadraticKinetic(), ForceField(acceleration))`."
 )
+
+
+# Of vectors in a plane and in space, as many as these have dimensions.
+_SPACES = (2, 2), (3, 3)
 
 
 def as_form(form, name: str, instead: str = ""):
@@ -130,9 +135,15 @@ def fit_form(form, x: PyTree, name: str, state: str, symmetric: bool = True) -> 
                 f"{name} of shape {form.shape} does not fit `{state}` of shape "
                 f"{shape}. Pass a number, or an array with as many dimensions as "
                 f"`{state}` that broadcasts to it, for example `x[:, None]` for `n` "
-                f"particles with `{state}` of shape `(n, 3)`; or a matrix for a vector "
-                f"`{state}`."
+                f"particles with `{state}` of shape `(n, 3)`; or a matrix for each "
+                f"vector over the last axis of `{state}`, for example `x[None]` for "
+                "one matrix for all particles."
             )
+        if shape[-2:] in _SPACES and form.shape == shape:
+            # That of a magnetic field would be taken for its entries.
+            off = jnp.where(np.eye(shape[-1], dtype=bool), 0, form)
+            is_field = jnp.all(off == -jnp.swapaxes(off, -1, -2)) & jnp.any(off != 0)
+            form = tree.invalid_if(is_field, form)
         return form
 
     if eqx.is_array(form):

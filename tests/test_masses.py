@@ -1,4 +1,4 @@
-"""Masses and stiffnesses of all forms, and momenta and velocities of each other."""
+"""Masses, stiffnesses and friction of all forms; momenta of velocities and back."""
 
 from typing import Any
 
@@ -252,3 +252,25 @@ def test_the_gradient_through_an_operator_that_is_not_symmetric():
     slope = jax.grad(lambda p: jnp.sum(mass.velocity(0.0, p) ** 2))(P)
     inverse = np.linalg.inv(matrix)
     np.testing.assert_allclose(slope, 2 * inverse.T @ inverse @ P, rtol=1e-14)
+
+
+# Friction of several particles.
+
+
+@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize("by_place", [False, True])
+@pytest.mark.parametrize("solver", [dps.BlanesMoan4(), dfx.Tsit5()])
+def test_the_matrix_of_a_field_is_not_taken_for_its_entries(n, by_place, solver):
+    field = 0.1 * jnp.eye(n) + jnp.tri(n, k=-1) - jnp.tri(n, k=-1).T
+    q, p = np.random.default_rng(0).normal(size=(2, n, n))
+
+    def solved(C, y0):
+        law = dps.ViscousDamping((lambda t, q, args: C) if by_place else C)
+        system = dps.MechanicalSystem(dps.QuadraticKinetic(), harmonic, law)
+        return flat(solve(system, solver, 0.0, 1.0, 0.01, y0, throw=False).ys)
+
+    assert not np.any(np.isfinite(solved(field, (q, p))[n * n :]))
+    each = [solved(field, y0) for y0 in zip(q, p, strict=True)]
+    each = np.moveaxis(np.reshape(each, (n, 2, n)), 1, 0)
+    together = np.reshape(solved(field[None], (q, p)), (2, n, n))
+    np.testing.assert_allclose(together, each, rtol=0, atol=1e-13)

@@ -104,7 +104,9 @@ class ViscousDamping(AbstractFriction):
             - A square matrix, with `p` a vector; not necessarily symmetric.
             - An array with one dimension more than `p`: a matrix for each vector over
                 the last axis of `p`. For the same matrix of `n` particles in three
-                dimensions, with `p` of shape `(n, 3)`, pass shape `(1, 3, 3)`.
+                dimensions, with `p` of shape `(n, 3)`, pass shape `(1, 3, 3)`. Of
+                shape `(3, 3)`, for three particles, it would be taken for coefficients
+                of entries; that of a magnetic field makes the solve fail then.
             - A pytree of the structure of `p`, whose leaves are any of the above.
             - A `lineax.AbstractLinearOperator`, with `p` a vector. It is used as its
                 matrix.
