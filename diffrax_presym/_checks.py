@@ -72,12 +72,19 @@ def check_callable(
         parameters = inspect.signature(fn)
     except (TypeError, ValueError):  # of a builtin, say
         return
+    expected = signature[:-1].partition("(")[2].split(", ")
+    positions = {
+        name: i
+        for i, (name, x) in enumerate(parameters.parameters.items())
+        if x.kind is x.POSITIONAL_OR_KEYWORD
+    }
+    ordered = all(positions.get(name, i) == i for i, name in enumerate(expected))
     try:
-        parameters.bind(*signature.split(","))
+        parameters.bind(*expected)
     except TypeError:
-        raise ValueError(
-            f"{wanted} one of the arguments {parameters}.{instead}"
-        ) from None
+        ordered = False
+    if not ordered:
+        raise ValueError(f"{wanted} one of the arguments {parameters}.{instead}")
 
 
 def describe(tree: PyTree) -> str:

@@ -5,6 +5,8 @@ Each message says what was given, what is expected, and what to write instead.
 
 # pyright: reportArgumentType=false, reportOptionalSubscript=false
 
+from functools import partial
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -259,6 +261,31 @@ SOLVERS = {
 @raising(SOLVERS)
 def test_solvers(act, parts):
     check(act, parts)
+
+
+# Arguments of functions, by their names.
+
+ORDERS = {
+    "a potential": (lambda: mechanics(potential=lambda q, t, args: jnp.sum(q)),
+        "`V(t, q, args)`", "got one of the arguments (q, t, args)"),
+    "a force": (lambda: mechanics(force=lambda t, v, q, args: -v),
+        "`f(t, q, v, args)`", "the arguments (t, v, q, args)"),
+    "an energy": (lambda: dps.Hamiltonian(lambda q, p, t, args: q @ p),
+        "`E(t, q, p, args)`", "the arguments (q, p, t, args)"),
+    "friction": (lambda: dps.PositionDamping(lambda q, t, args: 0.1),
+        "`rate(t, q, args)`", "the arguments (q, t, args)"),
+}  # fmt: skip
+
+
+@raising(ORDERS)
+def test_arguments_in_another_order(act, parts):
+    check(act, parts)
+
+
+def test_arguments_of_any_other_names():
+    square = lambda t, x, *args: jnp.sum(x**2)
+    mechanics(potential=square, force=lambda time, x, u, args=None: -u)
+    mechanics(potential=partial(lambda k, t, q, args: k * jnp.sum(q**2), 2.0))
 
 
 def test_equal_weights_ask_nothing_of_the_base():

@@ -3,6 +3,7 @@
 from typing import Any
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -48,6 +49,24 @@ def test_an_infinite_step_is_as_long_as_it_can_be(adjoint, controller, steps):
     sol = solve(jnp.inf, stepsize_controller=controller, adjoint=adjoint)
     assert sol.result == dfx.RESULTS.successful and sol.stats["num_steps"] == steps
     np.testing.assert_allclose(np.ravel(sol.ys), exact([1.0])[:, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("dt0, t1", [(0.0, 1.0), (0.1, jnp.inf), (0.1, jnp.nan)])
+def test_a_solve_that_never_ends_fails_at_once(dt0, t1):
+    y0 = jnp.ones(1), jnp.ones(1)
+
+    def end(dt0, t1, throw=False) -> Any:
+        args = PENDULUM, dps.TunedRKN6(), 0.0, t1, dt0, y0
+        return dfx.diffeqsolve(*args, max_steps=None, adjoint=OWN, throw=throw)
+
+    several = jnp.array([dt0, 0.1]), jnp.array([t1, 1.0])
+    sol, one = jax.vmap(end)(*several), end(0.1, 1.0)
+    np.testing.assert_array_equal(sol.stats["num_steps"], [0, 10])
+    success = sol.result == dfx.RESULTS.successful
+    np.testing.assert_array_equal(success, [False, True])
+    np.testing.assert_allclose(sol.ys[0][1], one.ys[0], rtol=1e-14)
+    with pytest.raises(eqx.EquinoxRuntimeError, match="max_steps"):
+        end(dt0, t1, throw=True)
 
 
 @pytest.mark.parametrize("adjoint", [OWN, dfx.RecursiveCheckpointAdjoint()])

@@ -16,7 +16,7 @@ from .._results import NONFINITE
 from .._scheme._base import AbstractPresymplecticSolver, Point
 from .._scheme._engine import Result
 from .._system._bound import System
-from ._base import AbstractSteps
+from ._base import AbstractSteps, MOST_STEPS
 from ._nodes import first_node, Node, node, number_of_derivatives, Stencils
 from ._rows import Row, Rows
 from ._steps import Steps
@@ -162,7 +162,11 @@ class Problem(eqx.Module):
     def last(self) -> Int[Array, ""]:
         """The number of steps, if none fails."""
         total = self.steps.total
-        return total if self.max_steps is None else jnp.minimum(total, self.max_steps)
+        if self.max_steps is not None:
+            return jnp.minimum(total, self.max_steps)
+        # Of steps of length zero, and to a time that is not finite, no number suffices.
+        never = self.steps.are_known & (total == MOST_STEPS)
+        return jnp.where(never, 0, total)
 
     def between(
         self,
