@@ -6,6 +6,7 @@ from typing import Literal
 import diffrax as dfx
 import equinox as eqx
 import equinox.internal as eqxi
+import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -325,8 +326,17 @@ def _solve_bwd(trace, bars, perturbed, inputs, way: Reversal | Checkpoints):
     none = lambda x: jtu.tree_map(lambda _: None, x)
     where = lambda x: (x.functions, x.start[0], x.start[1])
     found = jtu.tree_map(lambda x: jnp.where(used, x, 0), (at.gradient, at.bar[0]))
-    # What the solve begins with besides was pulled back: no zeros, which JAX would.
-    found = *found, none(problem.start[1])
+    # What the solve begins with besides was pulled back: no zeros, which JAX would. But
+    # JAX 0.6 has no derivative of a linear solve, as of multipliers, by none.
+    no_zeros = jax.__version_info__ >= (0, 7)
+    found = (
+        *found,
+        none(problem.start[1])
+        if no_zeros
+        else jtu.tree_map(
+            jnp.zeros_like, eqx.filter(problem.start[1], eqx.is_inexact_array)
+        ),
+    )
     gradient = eqx.tree_at(where, none(problem), found, is_leaf=_none)
     return gradient, none(buffers)
 
