@@ -61,8 +61,8 @@ typed: $(VENV)/.with-tests  ## Run tests with annotations checked at run time
 		$(addprefix tests/test_,order.py friction.py wrappers.py diagnostics.py step_density.py)
 
 # By default the code of the documentation, which covers most features, what is private
-# in Diffrax, and masses, of which gradients with constraints failed there. `make oldest TESTS=tests` runs all tests. Deprecation warnings
-# between old versions are ignored.
+# in Diffrax, and masses, of which gradients with constraints failed there. `make oldest
+# TESTS=tests` runs all tests. Deprecation warnings between old versions are ignored.
 oldest: TESTS ?= $(addprefix tests/test_,docs.py diffrax_contract.py masses.py)
 oldest: $(OLDEST)/.installed  ## Test the documentation with the oldest dependencies
 	@$(OLDEST)/bin/python $(PYTEST) -W ignore::DeprecationWarning $(TESTS)

@@ -141,7 +141,8 @@ def fit_form(form, x: PyTree, name: str, state: str, symmetric: bool = True) -> 
             )
         if shape[-2:] in _SPACES and form.shape == shape:
             # That of a magnetic field would be taken for its entries.
-            off = jnp.where(np.eye(shape[-1], dtype=bool), 0, form)
+            diagonal = np.broadcast_to(np.eye(shape[-1], dtype=bool), shape)
+            off = jnp.where(diagonal, 0, form)
             is_field = jnp.all(off == -jnp.swapaxes(off, -1, -2)) & jnp.any(off != 0)
             form = tree.invalid_if(is_field, form)
         return form

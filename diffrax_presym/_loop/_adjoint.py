@@ -328,15 +328,10 @@ def _solve_bwd(trace, bars, perturbed, inputs, way: Reversal | Checkpoints):
     found = jtu.tree_map(lambda x: jnp.where(used, x, 0), (at.gradient, at.bar[0]))
     # What the solve begins with besides was pulled back: no zeros, which JAX would. But
     # JAX 0.6 has no derivative of a linear solve, as of multipliers, by none.
-    no_zeros = jax.__version_info__ >= (0, 7)
-    found = (
-        *found,
-        none(problem.start[1])
-        if no_zeros
-        else jtu.tree_map(
-            jnp.zeros_like, eqx.filter(problem.start[1], eqx.is_inexact_array)
-        ),
-    )
+    nothing = none(problem.start[1])
+    if jax.__version_info__ < (0, 7):
+        nothing = zeros(problem.start[1], nothing)
+    found = *found, nothing
     gradient = eqx.tree_at(where, none(problem), found, is_leaf=_none)
     return gradient, none(buffers)
 
