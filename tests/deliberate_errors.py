@@ -284,7 +284,7 @@ MUTANTS = [
         "tree.all_batched((progress.point, saved))", "(progress.point, saved)",
         tests="test_adjoint.py", only="several_places"),
     Mutant("what a solve begins with is differentiated outside",
-        "_loop/_adjoint.py", "found = *found, none(problem.start[1])",
+        "_loop/_adjoint.py", "found = *found, nothing",
         "found = *found, at.bar[1]", tests="test_adjoint.py", only="adds_nothing"),
     Mutant("a given number of kept states is not used", "_loop/_adjoint.py",
         "number, apart = self.checkpoints, 1",
